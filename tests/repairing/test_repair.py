@@ -3,6 +3,7 @@
 import time
 from dataclasses import replace
 
+import contour_kinds
 import numpy as np
 import pytest
 import trimesh
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 
 import warp_bsc as bsc
 from warp_bsc import checker
-from warp_bsc.bench.scenes.repair import KINDS, KNOWN, damaged
+from warp_bsc.bench.scenes.repair import KINDS, KNOWN, TangledMesh, damaged
 from warp_bsc.repairing.closest import closest_points, exit_distances
 from warp_bsc.repairing.surface import Surface
 
@@ -97,16 +98,12 @@ def test_a_contour_from_border_to_border_is_named():
     assert "order" in result.unresolved[0].reason
 
 
-def test_a_sheet_that_crosses_itself_from_its_border_is_opened():
-    n = 20
-    u, v = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, n + 1)] * 2, indexing="ij")).reshape(2, -1)
-    w = 0.8 * v - 0.1
-    x = np.stack([1.2 * u, w**3 - 0.6 * u * w, 0.8 * w * w], axis=1)
-    faces = grid_faces(n + 1, n + 1)
-    result = bsc.repair(faces, x, device="cpu")
-    assert result.certified and result.crossings_before > 20 and crossings(faces, result.x) == 0
-    lengths = [np.linalg.norm(y[faces] - y[np.roll(faces, 1, axis=1)], axis=2) for y in (x, result.x)]
-    assert np.median(np.abs(lengths[1] / lengths[0] - 1.0)) < 0.1
+@pytest.mark.parametrize("kind", contour_kinds.KINDS)
+def test_contours_of_each_kind_are_freed_without_a_hint_and_with_little_strain(kind):
+    faces, x = contour_kinds.KINDS[kind](20)
+    scene = TangledMesh(faces, x, None, np.zeros(len(x), dtype=bool), np.full(len(x), -1))
+    result = repair(scene, x)
+    assert result.certified and result.crossings_before > 10 and result.max_strain <= 0.1
 
 
 def test_a_sheet_that_is_folded_flat_opens_by_a_little():
@@ -194,15 +191,81 @@ def test_what_may_stay_at_its_place_stays_there(name):
     assert not little.any() or crossings(scene.faces, home)
 
 
+def in_halves(scene, gap=0.0):
+    """Returns faces and positions of a scene of one sheet in two halves, and both sides of the seam between them."""
+    n = len(scene.x)
+    is_first = scene.faces.min(axis=1) < int(0.84 * n)
+    faces = scene.faces + n * ~is_first[:, None]
+    seam = np.intersect1d(scene.faces[is_first], scene.faces[~is_first])
+    return faces, np.vstack([scene.x, scene.x + gap]), (seam, seam + n)
+
+
 def test_seams_stay_closed():
-    scene = KNOWN["folded"]()
-    doubled = np.vstack([scene.x, scene.x])
-    half = len(scene.faces) // 2
-    result = bsc.repair(np.vstack([scene.faces[:half], scene.faces[half:] + len(scene.x)]), doubled, device="cpu")
-    seam = np.intersect1d(scene.faces[:half], scene.faces[half:])
+    faces, x, (seam, other) = in_halves(KNOWN["folded"]())
+    result = bsc.repair(faces, x, device="cpu")
     assert result.certified
     assert result.moved[seam].any()
-    assert (result.x[seam] == result.x[seam + len(scene.x)]).all()
+    assert (result.x[seam] == result.x[other]).all()
+    assert result.doubled == len(seam)
+    assert f"{len(seam)} vertices of seams count as one" in str(result)
+    assert crossings(faces, result.x) > 0
+
+
+def test_seams_within_a_tolerance_are_closed_and_without_one_part():
+    faces, x, (seam, other) = in_halves(KNOWN["folded"](), gap=1e-9)
+    opened = bsc.repair(faces, x, device="cpu")
+    assert opened.doubled == 0 and not (opened.x[seam] == opened.x[other]).any()
+    for fixed, first in (([], seam), (other[:3], other[:3])):
+        result = bsc.repair(faces, x, fixed=fixed, seam_tolerance=1e-8, device="cpu")
+        assert result.certified and (result.x[seam] == result.x[other]).all()
+        assert not result.moved[fixed].any()
+        still = result.moved == 0.0
+        assert result.x[still].tobytes() == x[still].tobytes() and still[first].any()
+    with pytest.raises(ValueError, match=r"seam_tolerance must not close vertices \d+ and \d+, which are fixed apart"):
+        bsc.repair(faces, x, fixed=[seam[0], other[0]], seam_tolerance=1e-8, device="cpu")
+    with pytest.raises(ValueError, match=r"seam_tolerance must be less than the edges of face \d+"):
+        bsc.repair(faces, x, seam_tolerance=0.1, device="cpu")
+
+
+def test_a_seam_between_two_sheets_of_an_order_stays_closed():
+    """The border of a lining is sewn to that of the coat outside it, which has passed through it."""
+    n = 16
+    u, v = np.stack(np.meshgrid(*[np.linspace(0.0, 1.0, n)] * 2, indexing="ij")).reshape(2, -1)
+    bulge = np.minimum(u, 0.4)
+    lining = np.stack([u, v, 0.1 * bulge], axis=1)
+    coat = np.stack([u, v, 0.1 * bulge + 0.5 * bulge * (0.3 - v)], axis=1)
+    seam = np.flatnonzero(u == 0.0)
+    faces, x = np.concatenate([grid_faces(n, n), grid_faces(n, n) + n * n]), np.concatenate([lining, coat])
+    sheet = np.repeat([0, 1], n * n)
+    result = bsc.repair(faces, x, order=sheet, device="cpu")
+    assert result.crossings_before > 10 and result.certified and result.doubled == n
+    assert (result.x[seam] == result.x[seam + n * n]).all()
+
+
+@pytest.mark.parametrize(
+    ("factor", "offset", "dtype"),
+    [(1e4, 1e13, float), (1e100, 0.0, float), (1e-150, 0.0, float), (1.0, 1e3, np.float32), (1e30, 0.0, np.float32)],
+)
+def test_coordinates_of_any_size_are_repaired_as_well(factor, offset, dtype):
+    """Far from the origin, and where squares of lengths overflow or underflow."""
+    scene = KNOWN["folded"]()
+    x = (scene.x * factor + offset).astype(dtype)
+    begin = time.monotonic()
+    result = bsc.repair(scene.faces, x, device="cpu")
+    assert time.monotonic() - begin < 5.0
+    assert result.certified and result.crossings_before > 50 and result.max_strain <= 0.1
+    still = result.moved == 0.0
+    assert result.x[still].tobytes() == x[still].tobytes() and still.sum() > 2000
+    edges = bsc.CollisionMesh(scene.faces, len(x), device="cpu").edges
+    moved = np.flatnonzero(~still)
+    near = edges[np.isin(edges, moved).any(axis=1)]
+    pairs = np.stack(np.meshgrid(np.arange(len(near)), np.arange(len(scene.faces)), indexing="ij"), -1).reshape(-1, 2)
+    ends, corners = near[pairs[:, 0]], scene.faces[pairs[:, 1]]
+    places = result.x.astype(float)
+    boxes = [(places[of].min(axis=1), places[of].max(axis=1)) for of in (ends, corners)]
+    overlap = ((boxes[0][0] <= boxes[1][1]) & (boxes[1][0] <= boxes[0][1])).all(axis=1)
+    overlap &= (ends[:, :, None] != corners[:, None, :]).all(axis=(1, 2))
+    assert not checker.edge_face_crossings(result.x[ends[overlap]], result.x[corners[overlap]]).any()
 
 
 def test_no_mesh_of_no_faces_is_built(device, monkeypatch):

@@ -126,6 +126,34 @@ def test_sheets_change_places_by_their_order(device):
     assert (outer[:, 2] > inner[nearest, 2] - 0.005).all()
 
 
+def test_sheets_without_an_order_are_put_into_the_nearer_one_which_is_told(device):
+    builder = newton.ModelBuilder()
+    add_cloth(builder, (-0.3, -0.3, 0.0))
+    add_cloth(builder, (-0.307, -0.309, -0.03), wp.quat_from_axis_angle(wp.vec3(1.0, 0.0, 0.0), 0.1))
+    result, _ = repaired(builder, device)
+    assert result.crossings_before > 10
+    assert sorted(set(result.order)) == [0, 1]
+
+
+def test_cloth_that_is_folded_flat_opens_by_a_little(device):
+    builder = newton.ModelBuilder()
+    add_cloth(builder, (-0.3, -0.3, 0.0))
+    builder.particle_q = [wp.vec3(-abs(x), y + 0.1 * max(x, 0.0), z) for x, y, z in builder.particle_q]
+    result, _ = repaired(builder, device)
+    assert result.crossings_before > 100
+    assert result.moved.max() < 0.01 and result.max_strain < 0.02
+
+
+def test_cloth_that_crosses_itself_from_its_border_is_opened(device):
+    builder = newton.ModelBuilder()
+    add_cloth(builder, (-0.3, -0.3, 0.0))
+    u, v, _ = np.array(builder.particle_q).T / 0.3
+    w = 0.8 * v - 0.1
+    builder.particle_q = list(map(wp.vec3, 0.3 * np.stack([1.2 * u, w**3 - 0.6 * u * w, 0.8 * w * w], axis=1)))
+    result, _ = repaired(builder, device)
+    assert result.crossings_before > 10
+
+
 def test_what_stays_is_named_by_particles_and_changes_no_bit(device):
     """Kinematic particles in a box hold cloth that passes through its sides."""
     builder = newton.ModelBuilder()
@@ -201,7 +229,7 @@ def test_the_stage_names_the_repair_when_a_start_crosses(device):
     builder.color()
     model = builder.finalize(device=device)
     solver = bsc.SolverCCD(newton.solvers.SolverVBD(model, iterations=2))
-    with pytest.warns(UserWarning, match="repair_state"):
+    with pytest.warns(UserWarning, match=r"repair_state.*unresolved.*order"):
         solver.step(model.state(), model.state(), model.control(), None, 1.0 / 480.0)
         assert solver.report.crossings > 0
     assert "repair_state" in str(solver.report)

@@ -399,6 +399,7 @@ def calls() -> dict[str, Call]:
             | {"negative": np.full(6, -2), "shared": [[0, 1], [1, 2]], "out of range": [[0], [9]]},
             "x_previous": without(COORDINATES, "None") | {"single": X.astype(np.float32)},
             "min_distance": without(DISTANCES, "None"),
+            "seam_tolerance": without(DISTANCES, "None") | {"wider than faces": 10.0},
             "max_strain": {**NUMBERS, "zero": 0.0, "negative": -1.0},
             "time_limit": {**without(NUMBERS, "None"), "zero": 0.0, "negative": -1.0},
             "device": {"beside a mesh": "cpu"},

@@ -4,19 +4,23 @@ import numpy as np
 
 from .contacts import Contacts, projected
 from .elastic import Springs
-from .motion import move_freely
+from .motion import contacts_at, move_freely
 from .surface import Surface
 
-_ROUNDS = 24
-_SWEEPS, _MORE_SWEEPS, _MOST_SWEEPS = 40, 160, 640
-"""Sweeps of a round in which strains are below the limit at its start, above it, and once such rounds do no more."""
+_ROUNDS = 60
+_LEAP = 4.0
+"""Largest way of a round towards the input, in edges: from far, all springs relax after each."""
+_MOMENTUM, _MOMENTUM_FAR = 0.8, 0.9
+_SWEEPS, _MORE_SWEEPS = 40, 160
+"""Sweeps of a round in which strains are below the limit at its start, and above it; as many more after each round
+that comes no nearer."""
 _RINGS = 10
 """Edges around vertices in contact within which springs move others."""
 _SETTLED = 2.0**-10
 """Move, in edges, below which the approach ends."""
 _PROGRESS = 0.98
 """Share of the strain above the limit, or of the moves once there is none, to which a round must come down."""
-_PATIENCE = 4
+_PATIENCE = 8
 """Rounds that do not, after which the approach ends; one if strains are below the limit."""
 _SMALL = 0.03
 """Move, in edges, that in the end is taken back where that meets nothing."""
@@ -39,28 +43,38 @@ def approach(surface: Surface, x: np.ndarray, springs: Springs, max_strain: floa
     """
     best, score = x, score_of(surface, x, max_strain)
     best_score = score
-    held, stalled, known, more = np.zeros(len(x), dtype=bool), 0, Contacts.none(), _MORE_SWEEPS
+    held, stalled, contacts, nearest = np.zeros(len(x), dtype=bool), 0, Contacts.none(), np.inf
     for _ in range(_ROUNDS):
         goal = np.where(held[:, None], x, surface.home)
-        if held.any():
-            around = springs.around(held, _RINGS)
-            sweeps = more if score[0] else _SWEEPS
-            goal = springs.relax(goal, sweeps, _SOUGHT * max_strain, contacts=known, around=around)
+        farthest = np.abs(goal - x).max(initial=0.0)
+        is_far = farthest > _LEAP * surface.edge
+        if is_far:
+            goal = x + _LEAP * surface.edge / farthest * (goal - x)
+        if is_far or held.any():
+            # planes of earlier positions would keep pairs from places that are free
+            known = Contacts.joined([contacts, contacts_at(surface, x, held)]).latest()
+            goal = springs.relax(
+                goal,
+                _MORE_SWEEPS * (1 + stalled) if score[0] else _SWEEPS,
+                _SOUGHT * max_strain,
+                momentum=_MOMENTUM_FAR if is_far else _MOMENTUM,
+                contacts=known,
+                around=None if is_far else springs.around(held, _RINGS),
+            )
             goal = projected(surface.fixed, goal, known, device=surface.device)
         goal = surface.rounded(goal)
         if _are_near(x, goal, surface.edge):
             break
         start, (x, contacts) = x, move_freely(surface, x, goal)
-        known = Contacts.joined([known, contacts]).latest()
         held[contacts.vertices] = True
-        before, score = score, score_of(surface, x, max_strain)
-        stalled = 0 if _is_better(before, score) or _is_better(best_score, score) else stalled + 1
+        score = score_of(surface, x, max_strain)
+        is_nearer = is_far and farthest < _PROGRESS * nearest
+        nearest = min(nearest, farthest)
+        stalled = 0 if is_nearer or _is_better(best_score, score) else stalled + 1
         if score < best_score:
             best, best_score = x, score
         if _are_near(start, x, surface.edge) or stalled >= (_PATIENCE if score[0] else 1) or surface.is_late:
-            if not score[0] or more == _MOST_SWEEPS or surface.is_late:
-                break
-            more, stalled = _MOST_SWEEPS, 0
+            break
     goes_home = surface.moves(best) < _SMALL * surface.edge
     while True:
         goal = surface.rounded(np.where(goes_home[:, None], surface.home, best))

@@ -92,3 +92,29 @@ def checked_sheets(order: Any, count: int) -> np.ndarray:
             raise ValueError(f"order[{number}] has vertex {vertex}, which order[{sheet[vertex]}] has as well")
         sheet[mask] = number
     return sheet
+
+
+def checked_seams(mesh: CollisionMesh, x: np.ndarray, weld: np.ndarray, fixed: np.ndarray) -> np.ndarray:
+    """Returns for each vertex the one whose position it gets where seams are closed: a fixed one if there is one.
+
+    Args:
+        mesh: The mesh.
+        x: Positions, shape [n, 3].
+        weld: The vertex that each vertex is welded to, int, shape [n].
+        fixed: Vertices that stay, bool, shape [n].
+
+    Raises:
+        ValueError: If two fixed vertices that are apart are welded, or two corners of a face.
+    """
+    first, rows = np.arange(len(x)), np.flatnonzero(fixed)[::-1]
+    first[weld[rows]] = rows
+    weld = first[weld]
+    moved = fixed & np.isin(weld, rows) & (x != x[weld]).any(axis=1)
+    if moved.any():
+        vertex = np.argmax(moved)
+        raise ValueError(f"seam_tolerance must not close vertices {weld[vertex]} and {vertex}, which are fixed apart")
+    corners = np.sort(mesh.faces, axis=1), np.sort(weld[mesh.faces], axis=1)
+    before, after = ((of[:, 1:] == of[:, :-1]).sum(axis=1) for of in corners)
+    if (after > before).any():
+        raise ValueError(f"seam_tolerance must be less than the edges of face {np.argmax(after > before)}")
+    return weld

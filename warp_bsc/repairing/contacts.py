@@ -68,7 +68,7 @@ class Contacts:
         return Contacts(*(np.concatenate(values) for values in zip(*(vars(c).values() for c in contacts), strict=True)))
 
 
-def as_contacts(mesh: CollisionMesh, found: Collisions, gap: float) -> Contacts:
+def as_contacts(mesh: CollisionMesh, found: Collisions, gap: float = 0.0) -> Contacts:
     """Returns collisions of a mesh with faces and edges in one form; ``gap`` is the distance that they are to have."""
     beta = found.vertex_face_coordinates
     s, r = found.edge_edge_coordinates[:, 0, None], found.edge_edge_coordinates[:, 1, None]

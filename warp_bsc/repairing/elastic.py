@@ -10,6 +10,9 @@ from .surface import Surface
 
 _BENDING = 0.3
 """Stiffness of the springs across edges, which keep dihedral angles, as a share of that of edges."""
+_SHORTEST = 10.0
+"""Median length of an edge, in lengths of a spring, up to which shorter springs are stiffer, so that strains even out.
+"""
 _NOT_REACHED = 2**31 - 1
 
 
@@ -67,7 +70,10 @@ class Springs:
             array(np.append(np.searchsorted(both[order, 0], vertices), len(order)), int),
             array(both[order, 1], int),
         ]
-        self._rest = [array(np.tile(values, 2)[order], wp.float64) for values in (lengths, stiffness)]
+        shortness = np.clip(surface.edge / np.maximum(lengths, 1e-30), 0.1, _SHORTEST)
+        self._lengths, self._even, self._by_strain = (
+            array(np.tile(values, 2)[order], wp.float64) for values in (lengths, stiffness, stiffness * shortness**2)
+        )
 
     def around(self, vertices: np.ndarray, rings: int) -> np.ndarray:
         """Returns the movable vertices within some edges, that springs follow, of given ones, bool, shape [n]."""
@@ -90,6 +96,7 @@ class Springs:
         sweeps: int,
         slack: float = 0.0,
         *,
+        momentum: float = 0.0,
         contacts: Contacts | None = None,
         around: np.ndarray | None = None,
     ) -> np.ndarray:
@@ -99,6 +106,8 @@ class Springs:
             x: Positions, in units, shape [n, 3].
             sweeps: Number of Jacobi sweeps.
             slack: Strain that needs no change.
+            momentum: Share of the last move that each sweep makes once more, less than 1: more than 0 spreads strains
+                as far as the square of as many sweeps, and evens out strains rather than changes of length.
             contacts: Contacts that are kept apart meanwhile, nearly; default: none.
             around: The movable vertices that move, bool, shape [n]; default: all.
         """
@@ -107,7 +116,15 @@ class Springs:
         if around is not None:
             (moving,) = np.nonzero(around[self._vertices])
             rows, count = self._surface.array(moving, int), len(moving)
-        inputs = [rows, *self._springs, *self._rest, planes, wp.float64(slack)]
+        inputs = [
+            rows,
+            *self._springs,
+            self._lengths,
+            self._by_strain if momentum else self._even,
+            planes,
+            wp.float64(slack),
+            wp.float64(momentum),
+        ]
         return self._sweep(relax_springs, count, inputs, x, sweeps)
 
     def _planes(self, contacts: Contacts) -> Planes:

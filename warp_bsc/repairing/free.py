@@ -1,23 +1,99 @@
-"""Frees a surface: untangles or smooths it and returns towards the input; restores the parts that got no better."""
+"""The search of a repair: untangles a surface, or parts or smooths its pieces, and returns towards the input."""
 
 from collections.abc import Callable
 
 import numpy as np
 
-from .approach import approach
+from .approach import approach, score_of
 from .contours import connected_components
 from .elastic import Springs, near
-from .motion import push_apart
+from .motion import Faults, push_apart
 from .sheets import separate_sheets
 from .surface import Surface, differ
+from .tetrahedra import follow_surface
 from .untangle import untangle
 
 _RINGS = 10
 """Edges around vertices that are pushed apart within which others may follow."""
 _OFFSET = 0.1
 """Distance by which layers that lie on each other leave each other, in edges."""
+_FAR = 4.0
+"""Move, in edges, above which another order of pieces is tried, which may be nearer."""
+_FLATTEST = 0.01
+"""Length of the sum of normals around a vertex, as a share of that of their lengths, below which it has no normal."""
 _SWEEPS, _DOUBLINGS = 8, 10
 """Sweeps after which a smoothed surface is looked at first, and how often they are doubled."""
+
+
+def search(
+    surface: Surface, max_strain: float, *, history: np.ndarray | None = None, sheet: np.ndarray | None = None
+) -> tuple[Faults, Faults, np.ndarray]:
+    """Returns what is wrong with the input, and with the best positions that are found, the input if none are better.
+
+    Args:
+        surface: The surface.
+        max_strain: Largest strain that is sought.
+        history: Positions at which nothing crosses, in units, shape [n, 3]; default: none.
+        sheet: Sheet of each vertex from inside to outside, -1 for none, int, shape [n]; default: not known.
+
+    Returns:
+        Both, and the sheet of each vertex in an order that was chosen, see :func:`free_by_order`.
+    """
+    before, chosen = Faults(surface, surface.home), np.full(len(surface.home), -1)
+    if not before:
+        return before, before, chosen
+    after = Faults(surface, _found(surface, before, max_strain, history, sheet, chosen))
+    if after.count:
+        restored = Faults(surface, _restored(surface, before, after))
+        if len(restored.crossings) <= len(before.crossings):
+            after = restored
+    if after.are_fewer(before) and not surface.is_wrecked(after.x):
+        return before, after, chosen
+    return before, before, np.full_like(chosen, -1)
+
+
+def _found(
+    surface: Surface,
+    before: Faults,
+    max_strain: float,
+    history: np.ndarray | None,
+    sheet: np.ndarray | None,
+    chosen: np.ndarray,
+) -> np.ndarray:
+    """Returns the best positions that :func:`search` finds, in units; they may be worse than the input."""
+    if history is not None:
+        reached = approach(surface, history, Springs(surface, ~surface.fixed), max_strain)
+        # fixed vertices that contact keeps from their places cannot stay elsewhere
+        if (reached == surface.home)[surface.fixed].all():
+            return reached
+
+    def rank(x):
+        faults = Faults(surface, x)
+        return surface.is_wrecked(x), faults.count, len(faults.near), *score_of(surface, x, max_strain)
+
+    found, start, movable = [], surface.home, None
+    if sheet is not None:
+        start, movable = separate_sheets(surface, sheet, start), ~surface.fixed
+    elif (parted := offset(surface, before.crossings)) is not start:
+        moved = differ(parted, start)
+        found.append(free(surface, parted, surface.crossings(parted), max_strain, movable=moved))
+    if not found or any(rank(found[0])[:4]):
+        for begin, may_move in surface.starts(start, movable):
+            found.append(free(surface, begin, surface.crossings(begin), max_strain, movable=may_move))
+            if not Faults(surface, found[-1]):
+                break
+    x = min(found, key=rank)
+    if sheet is None and not surface.are_fixed(surface.crossings(x)).all():
+        x = free_by_order(surface, x, max_strain, rank, chosen)
+        x = min(x, free_by_smoothing(surface, x, max_strain), key=rank)
+    # what is inside solids has left them, and is no sheet
+    elif sheet is None and not before.inside.size and (rank(x)[3] or surface.moves(x).max() > _FAR * surface.edge):
+        ordered = free_by_order(surface, surface.home, max_strain, rank, chosen)
+        if rank(x) <= rank(ordered):
+            chosen[:] = -1
+        else:
+            x = ordered
+    return x
 
 
 def free(
@@ -44,7 +120,8 @@ def free(
     if movable is not None:
         may_move |= movable
     is_known = (may_move == untangled.springs.movable).all()
-    return approach(surface, x, untangled.springs if is_known else Springs(surface, may_move), max_strain)
+    x = approach(surface, x, untangled.springs if is_known else Springs(surface, may_move), max_strain)
+    return follow_surface(surface, x)
 
 
 def offset(surface: Surface, crossings: np.ndarray) -> np.ndarray:
@@ -59,9 +136,12 @@ def offset(surface: Surface, crossings: np.ndarray) -> np.ndarray:
     """
     faces, x = surface.mesh.faces, surface.home
     a, b, c = (x[faces[:, k]] for k in range(3))
-    normals = np.zeros_like(x)
-    np.add.at(normals, faces.ravel(), np.repeat(np.cross(b - a, c - a), 3, axis=0))
-    normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-30)[:, None]
+    normals, areas = np.zeros_like(x), np.cross(b - a, c - a)
+    np.add.at(normals, faces.ravel(), np.repeat(areas, 3, axis=0))
+    size = np.bincount(faces.ravel(), np.repeat(np.linalg.norm(areas, axis=1), 3), len(x))
+    lengths = np.linalg.norm(normals, axis=1)
+    # at a crease, normals cancel each other
+    normals *= (lengths > _FLATTEST * size)[:, None] / np.maximum(lengths, 1e-30)[:, None]
     moves = near(surface, np.append(surface.mesh.edges[crossings[:, 0]], surface.mesh.faces[crossings[:, 1]]), 1)
     _, piece = np.unique(connected_components(len(x), surface.edges)[moves], return_inverse=True)
     distances = np.zeros((len(x), 1))
@@ -106,16 +186,10 @@ def free_by_smoothing(surface: Surface, start: np.ndarray, max_strain: float) ->
         placed = means(start, piece)[piece] + scale * (x - means(x, piece)[piece])
         opened = surface.rounded(np.where(is_whole[:, None], placed, x))
         if surface.are_fixed(surface.crossings(opened)).all():
-            return approach(surface, opened, springs, max_strain)
+            return follow_surface(surface, approach(surface, opened, springs, max_strain))
         if surface.is_late:
             break
     return start
-
-
-def free_in_order(surface: Surface, sheet: np.ndarray, start: np.ndarray, max_strain: float) -> np.ndarray:
-    """Returns positions as :func:`free`, from where sheets are on their sides, see :func:`.sheets.separate_sheets`."""
-    x = separate_sheets(surface, sheet, start)
-    return free(surface, x, surface.crossings(x), max_strain, movable=~surface.fixed)
 
 
 def free_by_order(
@@ -127,7 +201,8 @@ def free_by_order(
         surface: The surface.
         x: Where the search begins, in units, shape [n, 3].
         max_strain: Largest strain that is sought.
-        rank: Tells whether positions are wrecked, how much crosses, the strain above the limit, and the squared moves.
+        rank: Tells whether positions are wrecked, how much crosses, how much is near, the strain above the limit, and
+            the squared moves.
         chosen: Sheet of each vertex from inside to outside, -1 for none, int, shape [n]; those that are chosen are
             written.
     """
@@ -143,7 +218,8 @@ def free_by_order(
         found = []
         for inner, outer in (pairs[0], pairs[0][::-1]):
             sheet = np.where(piece == inner, 0, np.where(piece == outer, 1, -1))
-            y = free_in_order(surface, sheet, np.where(sheet[:, None] < 0, x, surface.home), max_strain)
+            y = separate_sheets(surface, sheet, np.where(sheet[:, None] < 0, x, surface.home))
+            y = free(surface, y, surface.crossings(y), max_strain, movable=~surface.fixed)
             found.append((rank(y), inner, outer, y))
         best, inner, outer, y = min(found, key=lambda each: (each[0][:2], each[0][-1]))
         if best[:2] < rank(x)[:2]:
@@ -152,31 +228,24 @@ def free_by_order(
             chosen[piece == outer] = np.maximum(chosen[piece == outer], chosen[piece == inner].max() + 1)
 
 
-def restore_parts(
-    surface: Surface,
-    x: np.ndarray,
-    crossings: tuple[np.ndarray, np.ndarray],
-    inside: tuple[np.ndarray, np.ndarray] | None = None,
-) -> np.ndarray:
+def _restored(surface: Surface, before: Faults, after: Faults) -> np.ndarray:
     """Returns positions in which parts that still have most of their faults are as in the input.
 
     A part is connected by vertices that have moved and by crossings. What is fixed on both sides is no fault of a part.
 
     Args:
         surface: The surface.
-        x: Positions, in units, shape [n, 3].
-        crossings: What crosses in the input and at ``x``, (edge, face), shape [m, 2].
-        inside: Vertices inside solids in the input and at ``x``, int; default: none.
+        before: What is wrong with the input.
+        after: What is wrong with the positions.
     """
     mesh = surface.mesh
-    moved = differ(x, surface.home)
-    links, counts = [surface.edges[moved[surface.edges].all(axis=1)]], []
-    crossings = crossings[0][~surface.are_fixed(crossings[0])], crossings[1][~surface.are_fixed(crossings[1])]
-    for pairs in crossings:
+    moved = differ(after.x, surface.home)
+    links, faults = [surface.edges[moved[surface.edges].all(axis=1)]], []
+    for found in (before, after):
+        pairs = found.crossings[~surface.are_fixed(found.crossings)]
         ends, corners = mesh.edges[pairs[:, 0]], mesh.faces[pairs[:, 1]]
         links += [np.stack([ends[:, i], other], axis=1) for i in (0, 1) for other in corners.T]
-    part = connected_components(len(x), np.concatenate(links))
-    for pairs, vertices in zip(crossings, inside or [np.zeros(0, int)] * 2, strict=True):
-        faults = np.append(mesh.edges[pairs[:, 0], 0], vertices)
-        counts.append(np.bincount(part[faults], minlength=len(x)))
-    return np.where((2 * counts[1] > counts[0])[part][:, None], surface.home, x)
+        faults.append(np.append(ends[:, 0], found.inside))
+    part = connected_components(len(after.x), np.concatenate(links))
+    counts = [np.bincount(part[vertices], minlength=len(part)) for vertices in faults]
+    return np.where((2 * counts[1] > counts[0])[part][:, None], surface.home, after.x)

@@ -191,11 +191,14 @@ def relax_springs(
     planes: Planes,
     # in
     slack: wp.float64,
+    momentum: wp.float64,
     x: wp.array[wp.vec3d],
-    # out
+    # in and out
     relaxed: wp.array[wp.vec3d],
 ):
-    """Moves each vertex towards the lengths of its springs, and out of planes: one Jacobi sweep.
+    """Moves each vertex towards the lengths of its springs, and out of planes: one Jacobi sweep with momentum.
+
+    The output has the positions before the last sweep: a share of that move is made once more.
 
     The springs of vertex ``vertices[i]`` lead to ``ends[starts[i]:starts[i + 1]]``, for each i of ``rows``, or each
     i. Lengths within ``slack``, a share, of their rest length stay.
@@ -213,7 +216,8 @@ def relax_springs(
         wanted = wp.clamp(length, lengths[k] * (_ONE - slack), lengths[k] * (_ONE + slack))
         total += weights[k] * (length - wanted) * _direction(along)
         weight += weights[k]
-    relaxed[vertex] = p + _HALF * total / wp.max(weight, _TINY) + _push(i, x, planes)
+    last = p - relaxed[vertex]
+    relaxed[vertex] = p + _HALF * total / wp.max(weight, _TINY) + _push(i, x, planes) + momentum * last
 
 
 @wp.kernel

@@ -1,5 +1,7 @@
 """The surface of a Newton model in a state, with infinite planes as squares, and what of it is inside solids."""
 
+from collections.abc import Iterator
+
 import newton
 import numpy as np
 import warp as wp
@@ -13,7 +15,7 @@ from ..response.state.mesh import ModelMesh, Placement, elements_of
 from ..response.state.motion import plane_in
 from .contours import connected_components
 from .solids import leave_solid, leave_solid_whole, spread_exits
-from .surface import Surface, differ, weld_borders, welded
+from .surface import Surface, differ, weld_borders
 
 _ESCAPES = 4
 """Times that particles are put outside: the way out of a solid may lead into another one."""
@@ -21,71 +23,68 @@ _MARGIN = 2.0
 """Half the side of the square in place of a plane, as a multiple of the size of all else."""
 
 
-class ModelSurface:
+class ModelSurface(Surface):
     """The particles and shapes of a model in a state. Vertices are particles, then those of shapes and of planes.
 
-    Attributes:
-        surface: The surface, without doubled vertices. Pairs that cannot move do not count as crossing.
-        mesh: The mesh before vertices were welded.
-        weld: The vertex that each vertex is welded to, int, shape [n].
-        sheet: Sheet of each vertex, -1 for none, int, shape [n].
-        tetrahedra: Vertices of the tetrahedra, int, shape [m, 4].
+    Pairs that cannot move do not cross.
     """
 
-    def __init__(self, model: newton.Model, state: newton.State, sheet: np.ndarray, min_distance: float):
+    def __init__(self, model: newton.Model, state: newton.State, min_distance: float):
         """Places the mesh of a model.
 
         Args:
             model: The model.
             state: The state.
-            sheet: Sheet of each particle, -1 for none, int, shape [particle_count].
             min_distance: Distance that pairs keep [m].
 
         Raises:
             ValueError: If a position is not finite.
         """
         self._of_model = of_model = ModelMesh(model, strands=min_distance > 0.0)
-        self._finder = InsideFinder(of_model)
+        self._inside_finder = InsideFinder(of_model)
         placed = wp.empty(of_model.vertex_count, dtype=wp.vec3, device=model.device)
         of_model.positions(state.particle_q, state.body_q, placed)
         x = placed.numpy()
-        self.tetrahedra = elements_of(model.tet_indices, 4)
-        check_finite(x, "positions of the state", np.union1d(of_model.vertices, self.tetrahedra))
+        tetrahedra = elements_of(model.tet_indices, 4)
+        check_finite(x, "positions of the state", np.union1d(of_model.vertices, tetrahedra))
         self._planes = _planes_in(of_model, state)
-        self.mesh, self._x, self._shape, self._world = _with_planes(of_model, x, self._planes)
-        more = len(self._x) - model.particle_count
-        self.sheet = np.append(sheet, np.full(more, -1))
-        self.weld = weld_borders(self.mesh, self._x, self.sheet, self._world, self._shape)
-        self._soft_body = np.full(len(self._x), -1)
-        self._soft_body[self.tetrahedra] = connect_cells(self.tetrahedra, model.particle_count)[self.tetrahedra]
-        movable = np.append(of_model.inverse_masses.numpy() > 0.0, np.zeros(len(self._x) - len(x), dtype=bool))
-        fixed = np.bincount(self.weld, ~movable, len(self._x)) > 0
-        self.surface = Surface(
-            welded(self.mesh, self.weld),
-            self._x,
-            fixed,
-            min_distance,
-            tetrahedra=self.weld[self.tetrahedra],
-            counts_fixed=False,
-        )
-
-    def positions(self, x: np.ndarray) -> np.ndarray:
-        """Returns the positions of all vertices [m] at positions in units; what has not moved has its bits, float32."""
-        moved = differ(x, self.surface.home)[self.weld]
-        return np.where(moved[:, None], self.surface.positions(x)[self.weld], self._x)
+        mesh, x, self._shape, self._world = _with_planes(of_model, x, self._planes)
+        self._soft_body = np.full(len(x), -1)
+        self._soft_body[tetrahedra] = connect_cells(tetrahedra, model.particle_count)[tetrahedra]
+        masses = of_model.inverse_masses.numpy()
+        fixed = np.append(masses <= 0.0, np.ones(len(x) - len(masses), dtype=bool))
+        weld = weld_borders(mesh, x, self._world, self._shape)
+        super().__init__(mesh, x, fixed, min_distance, weld=weld, tetrahedra=tetrahedra)
 
     def crossings(self, x: np.ndarray) -> np.ndarray:
-        """Returns the edges that meet faces at positions in units, (edge, face); planes have no faces."""
-        mesh, count = self.surface.mesh, self._of_model.vertex_count
-        pairs = self.surface.crossings(x)
-        of_planes = (mesh.edges[pairs[:, 0]] >= count).any(axis=1) | (mesh.faces[pairs[:, 1]] >= count).any(axis=1)
-        return pairs[~of_planes]
+        """Returns the edges that meet faces at rounded positions in units, not all of whose vertices are fixed."""
+        pairs = super().crossings(x)
+        return pairs[~self.are_fixed(pairs)]
 
-    def inside(self, x: np.ndarray) -> Inside:
+    def counted(self, crossings: np.ndarray) -> np.ndarray:
+        """Returns the crossings that count as faults: planes have no faces."""
+        mesh, count = self.mesh, self._of_model.vertex_count
+        ends, corners = mesh.edges[crossings[:, 0]], mesh.faces[crossings[:, 1]]
+        return crossings[~((ends >= count).any(axis=1) | (corners >= count).any(axis=1))]
+
+    def inside(self, x: np.ndarray) -> np.ndarray:
+        """Returns the vertices inside solids at positions in units, one for each solid that it is in, int."""
+        return self.weld[self.particles_inside(x).particles]
+
+    def particles_inside(self, x: np.ndarray) -> Inside:
         """Returns the particles inside shapes, soft bodies and solids of planes at positions in units."""
-        return self._finder.find(self.positions(x)[: self._of_model.vertex_count], self._planes)
+        return self._inside_finder.find(self.positions(x)[: self._of_model.vertex_count], self._planes)
 
-    def leave_solids(self, x: np.ndarray, *, whole: bool) -> tuple[np.ndarray, np.ndarray]:
+    def starts(self, x: np.ndarray, movable: np.ndarray | None) -> Iterator[tuple[np.ndarray, np.ndarray | None]]:
+        """Yields positions in units with particles outside of solids, and vertices that may move in each.
+
+        What is deep inside a solid may leave it only as a whole.
+        """
+        for whole in (False, True) if len(self.inside(x)) else (False,):
+            outside, moved = self._leave_solids(x, whole=whole)
+            yield outside, moved if movable is None else movable
+
+    def _leave_solids(self, x: np.ndarray, *, whole: bool) -> tuple[np.ndarray, np.ndarray]:
         """Puts particles that are inside solids outside.
 
         Args:
@@ -96,14 +95,13 @@ class ModelSurface:
         Returns:
             Positions in units, and which vertices may have moved, bool, shape [n].
         """
-        surface, movable = self.surface, np.zeros(len(x), dtype=bool)
-        corners = self.mesh.faces[:, 0]
-        body = connected_components(len(x), surface.edges)
-        is_held = np.isin(body, body[surface.fixed])
+        movable, corners = np.zeros(len(x), dtype=bool), self.given.faces[:, 0]
+        body = connected_components(len(x), self.edges)
+        is_held = np.isin(body, body[self.fixed])
         for _ in range(_ESCAPES):
-            inside = self.inside(x)
+            inside = self.particles_inside(x)
             vertices = self.weld[inside.particles]
-            leaves = ~(is_held if whole else surface.fixed)[vertices]
+            leaves = ~(is_held if whole else self.fixed)[vertices]
             if not leaves.any():
                 break
             solids = np.column_stack([inside.shapes, inside.soft_bodies, self._world[inside.particles]])[leaves]
@@ -113,16 +111,16 @@ class ModelSurface:
                 is_face = (self._shape[corners] == shape) & (self._world[corners] == world)
                 (faces,) = np.nonzero(is_face & (self._soft_body[corners] == soft_body))
                 if whole:
-                    of_bodies = leave_solid_whole(surface, x, faces, of_solid, body)
+                    of_bodies = leave_solid_whole(self, x, faces, of_solid, body)
                     moves = np.where(differ(of_bodies, np.zeros_like(x))[:, None], of_bodies, moves)
                 else:
-                    moves[of_solid] = leave_solid(surface, x, faces, of_solid)
+                    moves[of_solid] = leave_solid(self, x, faces, of_solid)
                     moved[of_solid] = True
             if whole:
                 movable |= differ(moves, np.zeros_like(x))
-                x = surface.rounded(x + moves)
+                x = self.rounded(x + moves)
             else:
-                x, reach = spread_exits(surface, x, moves, moved)
+                x, reach = spread_exits(self, x, moves, moved)
                 movable |= reach
         return x, movable
 

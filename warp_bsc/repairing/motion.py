@@ -1,4 +1,7 @@
-"""Certified motions of a surface: as far towards a goal as contacts allow, and apart to a minimum distance."""
+"""Certified motions of a surface: as far towards a goal as contacts allow, and apart to a minimum distance; faults."""
+
+import functools
+from dataclasses import replace
 
 import numpy as np
 
@@ -10,7 +13,7 @@ _PROJECTIONS = 6
 _DETECTIONS = 40
 """Detections after which nothing moves."""
 _GAP = 2.0**-7
-"""Gap that contacts leave, in edges."""
+"""Gap that contacts leave, in edges of the median length, or the shortest ones of their vertices."""
 _MORE_DISTANCE = 1.0 + 2.0**-7
 """Distance at which contacts with a minimum distance are put, as a multiple of it."""
 _KEPT_TIME = 0.8
@@ -19,6 +22,40 @@ _LEAST_TIME = 0.05
 """Shares of the way that are less count as 0, so that the search for a motion ends."""
 _PATIENCE = 4
 """Pushes without fewer near pairs after which the search ends."""
+
+
+class Faults:
+    """What is wrong with positions.
+
+    Attributes:
+        x: Positions, in units of the surface, shape [n, 3].
+        crossings: What crosses and counts, (edge, face), shape [m, 2].
+        inside: Vertices inside solids, int.
+    """
+
+    def __init__(self, surface: Surface, x: np.ndarray):
+        """Finds them."""
+        self._surface, self.x = surface, x
+        self.crossings, self.inside = surface.counted(surface.crossings(x)), surface.inside(x)
+
+    @functools.cached_property
+    def near(self) -> np.ndarray:
+        """Pairs that are at most the minimum distance apart, by a number for each."""
+        return near_pairs(self._surface, self.x)
+
+    @property
+    def count(self) -> int:
+        """Number of crossings and of vertices inside solids."""
+        return len(self.crossings) + len(self.inside)
+
+    def __bool__(self) -> bool:
+        """Whether there is anything to repair."""
+        return bool(self.count or len(self.near))
+
+    def are_fewer(self, before: "Faults") -> bool:
+        """Whether less is wrong than before, and no more crosses."""
+        are_less = (self.count, len(self.near)) < (before.count, len(before.near))
+        return are_less and len(self.crossings) <= len(before.crossings)
 
 
 def move_freely(
@@ -76,9 +113,16 @@ def near_pairs(surface: Surface, x: np.ndarray) -> np.ndarray:
 
 def _near_contacts(surface: Surface, x: np.ndarray) -> Contacts:
     """Returns the pairs that are at most the minimum distance apart at positions in units, as contacts."""
-    positions = surface.positions(x)
+    positions = surface.detected(x)
     found = surface.distance_detector.detect(positions, positions)
     return as_contacts(surface.mesh, found, surface.min_distance * _MORE_DISTANCE)
+
+
+def contacts_at(surface: Surface, x: np.ndarray, held: np.ndarray) -> Contacts:
+    """Returns the pairs with held vertices that are near at positions in units, as contacts."""
+    positions = surface.detected(x)
+    found = as_contacts(surface.mesh, surface.reach_detector.detect(positions, positions, vertices=held))
+    return _with_gaps(surface, found.rows(np.asarray(held[found.vertices].any(axis=1))), near_pairs(surface, x))
 
 
 def _contacts(surface: Surface, start: np.ndarray, goal: np.ndarray, near: np.ndarray) -> Contacts:
@@ -90,12 +134,20 @@ def _contacts(surface: Surface, start: np.ndarray, goal: np.ndarray, near: np.nd
         goal: Positions at the end.
         near: Keys of the pairs that do not keep the minimum distance at the start: they must only not touch.
     """
-    x0, x1 = surface.positions(start), surface.positions(goal)
-    contacts = as_contacts(surface.mesh, surface.detector.detect(x0, x1), _GAP * surface.edge)
+    x0, x1 = surface.detected(start), surface.detected(goal)
+    contacts = as_contacts(surface.mesh, surface.detector.detect(x0, x1))
     if surface.min_distance:
-        found = surface.distance_detector.detect(x0, x1)
-        too_near = as_contacts(surface.mesh, found, surface.min_distance * _MORE_DISTANCE)
+        too_near = as_contacts(surface.mesh, surface.distance_detector.detect(x0, x1))
         too_near = too_near.rows(~np.isin(too_near.keys, near))
         contacts = Contacts.joined([contacts.rows(~np.isin(contacts.keys, too_near.keys)), too_near])
     moves = differ(start, goal)
-    return contacts.rows(np.asarray(moves[contacts.vertices].any(axis=1)))
+    return _with_gaps(surface, contacts.rows(np.asarray(moves[contacts.vertices].any(axis=1))), near)
+
+
+def _with_gaps(surface: Surface, contacts: Contacts, near: np.ndarray) -> Contacts:
+    """Returns contacts with the distances that they are to have: the minimum distance, unless they are near ones."""
+    # short edges would be strained by the gap of longer ones
+    gap = _GAP * surface.shortest[contacts.vertices].min(axis=1)
+    if surface.min_distance:
+        gap = np.where(np.isin(contacts.keys, near), gap, _MORE_DISTANCE * surface.min_distance)
+    return replace(contacts, gap=gap)

@@ -9,14 +9,12 @@ import warp as wp
 
 from .._arguments import check_finite, checked_distance, checked_number, checked_shape
 from ..detection.mesh import CollisionMesh
-from .approach import approach, score_of
-from .arguments import checked_mask, checked_mesh, checked_sheets
-from .elastic import Springs
-from .free import free, free_by_order, free_by_smoothing, free_in_order, offset, restore_parts
-from .motion import near_pairs
+from .arguments import checked_mask, checked_mesh, checked_seams, checked_sheets
+from .free import search
 from .results import RepairResult
-from .surface import Surface, differ, weld_borders, welded
-from .unresolved import unresolved_contours
+from .sheets import joined_sheets
+from .surface import Surface, differ, weld_borders
+from .unresolved import describe
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
@@ -30,6 +28,7 @@ def repair(
     order: np.ndarray | wp.array | Sequence | None = None,
     x_previous: np.ndarray | wp.array | None = None,
     min_distance: float = 0.0,
+    seam_tolerance: float = 0.0,
     max_strain: float = 0.1,
     time_limit: float | None = None,
     device: wp.DeviceLike = None,
@@ -50,9 +49,10 @@ def repair(
             for contour in result.unresolved:
                 print(contour.kind, contour.reason, contour.elements)
 
-    Vertices of borders that have the same position, sheet, world, groups and mask are one vertex: the two sides of
-    a seam do not part. Pairs of elements that share such a vertex are excluded, as all pairs that share a vertex: they
-    touch, and do not count. Faces that lie on each other with all of their corners at borders are among them.
+    Vertices of borders that have the same position, world, groups and mask are one vertex: the two sides of a seam do
+    not part, also if ``order`` has them in two sheets. Pairs of elements that share such a vertex are excluded, as all
+    pairs that share a vertex: they touch, and do not count. Faces that lie on each other with all of their corners at
+    borders are among them.
 
     Args:
         mesh: The mesh, or its faces: vertex indices, integers, shape [face_count, 3]; or a ``trimesh.Trimesh``,
@@ -67,6 +67,9 @@ def repair(
             tells which side is which: the result is reached from it without a collision.
         min_distance: Distance that elements keep, in the unit of the positions: 0 or at least 2^-1021. What is nearer
             is moved apart as far as that is possible; ``RepairResult.near`` tells.
+        seam_tolerance: Distance up to which vertices of borders count as one, in the unit of the positions: such seams
+            are closed, and both sides get the position of one of them, that of a fixed vertex if there is one. What is
+            written here of the input holds for the one with these seams closed. 0 for those in one position alone.
         max_strain: Largest change of the length of an edge that is sought, as a share of its length in ``x``, more than
             0. The result may exceed it where nothing else is free; ``RepairResult.max_strain`` tells.
         time_limit: Time after which the search ends with the best that it has found [s], more than 0: it still ends the
@@ -76,50 +79,36 @@ def repair(
     Raises:
         TypeError: If an argument has another type.
         ValueError: If an array has another shape or type, is not finite or out of range, ``x_previous`` crosses, a
-            number is out of range, or a device is given with a mesh.
+            number is out of range, a device is given with a mesh, or ``seam_tolerance`` makes one of two fixed vertices
+            that are apart, or of two corners of a face.
 
     References:
         Pascal Volino and Nadia Magnenat-Thalmann. "Resolving Surface Collisions through Intersection Contour
         Minimization." ACM Transactions on Graphics 25, 3 (2006). https://doi.org/10.1145/1141911.1142007.
     """
     mesh, given = checked_mesh(mesh, x, device)
-    fixed_mask = checked_mask(() if fixed is None else fixed, "fixed", len(given))
-    sheet = np.full(len(given), -1) if order is None else checked_sheets(order, len(given))
+    is_fixed = checked_mask(() if fixed is None else fixed, "fixed", len(given))
+    sheet = None if order is None else checked_sheets(order, len(given))
     previous = given if x_previous is None else _checked_previous(x_previous, given, mesh)
     distance = checked_distance(min_distance, "min_distance")
+    tolerance = checked_distance(seam_tolerance, "seam_tolerance")
     strain = checked_number(max_strain, "max_strain", 0.0, above=True)
     limit = np.inf if time_limit is None else checked_number(time_limit, "time_limit", 0.0, above=True)
-    weld = weld_borders(mesh, np.hstack([given, previous]), sheet)
-    welded_mesh = welded(mesh, weld)
-    is_fixed = np.bincount(weld, fixed_mask, len(given)) > 0
-    surface = Surface(welded_mesh, given, is_fixed, distance)
+    weld = weld_borders(mesh, np.hstack([given, previous]), tolerance=tolerance)
+    if tolerance:
+        weld = checked_seams(mesh, given, weld, is_fixed)
+    opened = differ(given, given[weld])  # by no more than the tolerance
+    surface = Surface(mesh, np.where(opened[:, None], given[weld], given), is_fixed, distance, weld=weld)
     surface.end = time.monotonic() + limit
-    before = surface.crossings(surface.home)
     history = None if x_previous is None else surface.in_units(previous)
     if history is not None and (count := len(surface.crossings(history))):
         raise ValueError(f"x_previous must not cross, but {count} edges meet faces in it")
-    near_before, chosen = near_pairs(surface, surface.home), np.full(len(given), -1)
-    final, crossings, near = surface.home, before, near_before
-    if len(before) or len(near_before):
-        final, crossings = _repaired(surface, before, history, None if order is None else sheet, strain, chosen)
-        near = near_pairs(surface, final)
-    if (len(crossings), len(near)) >= (len(before), len(near_before)) or surface.is_wrecked(final):
-        final, crossings, near = surface.home, before, near_before
-    positions = surface.positions(final)[weld]
-    has_moved = differ(final, surface.home)[weld]
-    result = np.where(has_moved[:, None], positions, given)
-    return RepairResult(
-        x=_as_given(result, x),
-        certified=not len(crossings) and bool(np.isin(near, near_before).all()),
-        crossings_before=len(before),
-        crossings=len(crossings),
-        near_before=len(near_before),
-        near=len(near),
-        moved=surface.moves(final)[weld] * surface.unit,
-        max_strain=surface.strain(final),
-        unresolved=unresolved_contours(surface, mesh, weld, crossings),
-        order=chosen[weld] if final is not surface.home and (chosen >= 0).any() else None,
-    )
+    sheet = None if sheet is None else joined_sheets(sheet, weld)
+    before, after, chosen = search(surface, strain, history=history, sheet=sheet)
+    positions = surface.positions(after.x)
+    found = describe(surface, before, after, chosen, len(given))
+    found["moved"][opened] = np.linalg.norm(positions[opened].astype(float) - given[opened], axis=1)
+    return RepairResult(**found, x=_as_given(positions, x))
 
 
 def _checked_previous(x_previous: np.ndarray | wp.array, x: np.ndarray, mesh: CollisionMesh) -> np.ndarray:
@@ -132,47 +121,6 @@ def _checked_previous(x_previous: np.ndarray | wp.array, x: np.ndarray, mesh: Co
         )
     check_finite(previous, "x_previous", mesh.vertices)
     return previous
-
-
-def _repaired(
-    surface: Surface,
-    before: np.ndarray,
-    history: np.ndarray | None,
-    sheet: np.ndarray | None,
-    max_strain: float,
-    chosen: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the best positions that are found, in units of the surface, and what crosses there; they may be worse.
-
-    Writes the sheets whose order it had to choose to ``chosen``.
-    """
-    if history is not None:
-        reached = approach(surface, history, Springs(surface, ~surface.fixed), max_strain)
-        # fixed vertices that contact keeps from their places cannot stay elsewhere
-        if (reached == surface.home)[surface.fixed].all():
-            return reached, surface.crossings(reached)
-
-    def rank(x):
-        return surface.is_wrecked(x), len(surface.crossings(x)), *score_of(surface, x, max_strain)
-
-    if sheet is None:
-        x, start = surface.home, offset(surface, before)
-        if start is not surface.home:
-            x = free(surface, start, surface.crossings(start), max_strain, movable=differ(start, surface.home))
-        if start is surface.home or score_of(surface, x, max_strain)[0]:
-            x = min(x, free(surface, surface.home, before, max_strain), key=rank)
-    else:
-        x = free_in_order(surface, sheet, surface.home, max_strain)
-    left = surface.crossings(x)
-    if sheet is None and not surface.are_fixed(left).all():
-        x = free_by_order(surface, x, max_strain, rank, chosen)
-        x = min(x, free_by_smoothing(surface, x, max_strain), key=rank)
-        left = surface.crossings(x)
-    if not len(left):
-        return x, left
-    restored = restore_parts(surface, x, (before, left))
-    crossings = surface.crossings(restored)
-    return (restored, crossings) if len(crossings) <= len(before) else (x, left)
 
 
 def _as_given(result: np.ndarray, x: np.ndarray | wp.array | None) -> np.ndarray | wp.array:

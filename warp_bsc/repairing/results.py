@@ -40,6 +40,7 @@ class RepairResult:
         near: Number of those in ``x``.
         moved: Distance of each vertex from its input, in the unit of the positions, float64, shape [vertex_count].
         max_strain: Largest change of the length of an edge, as a share of its length in the input.
+        doubled: Number of vertices that count as one with another, at seams.
         unresolved: The contours that remain.
         order: Sheets that had changed places and were put into an order that nobody told, as the argument ``order``
             has them: the number of each vertex from inside to outside, -1 for none, int, shape [vertex_count]; pass
@@ -54,5 +55,17 @@ class RepairResult:
     near: int
     moved: np.ndarray
     max_strain: float
+    doubled: int
     unresolved: tuple[UnresolvedContour, ...]
     order: np.ndarray | None
+
+    def __str__(self) -> str:
+        """Returns a line that says whether nothing crosses, and what that does not count."""
+        line = f"{self.crossings_before:,} crossings before, {self.crossings:,} after"
+        line += ", certified" if self.certified else ", not certified"
+        if self.doubled:
+            line += (
+                f"; {self.doubled:,} vertices of seams count as one with another: find_intersections of the faces as "
+                "given lists pairs that touch there"
+            )
+        return line

@@ -15,6 +15,17 @@ _RINGS = 12
 _SWEEPS = 12
 
 
+def joined_sheets(sheet: np.ndarray, weld: np.ndarray) -> np.ndarray:
+    """Returns the sheet of each vertex, -1 for those that join two sheets: a seam between them stays closed.
+
+    Args:
+        sheet: Sheet of each vertex from inside to outside, -1 for none, int, shape [n].
+        weld: The vertex that each vertex is welded to, int, shape [n].
+    """
+    differs = np.bincount(weld, sheet != sheet[weld], len(sheet)) > 0
+    return np.where(differs[weld], -1, sheet)
+
+
 def separate_sheets(surface: Surface, sheet: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Returns positions in which sheets that cross are on their sides, nearly: contours may remain.
 

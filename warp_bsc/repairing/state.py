@@ -11,13 +11,12 @@ from .._arguments import check_instance, checked_distance, checked_number
 from ..detection.mesh import CollisionMesh
 from ..response.report.inside import Inside
 from .arguments import checked_sheets
-from .free import free, restore_parts
+from .free import search
 from .model_surface import ModelSurface
-from .motion import near_pairs
 from .results import RepairResult
-from .sheets import separate_sheets
-from .tetrahedra import are_inverted, follow_surface, restore_inverted
-from .unresolved import unresolved_contours
+from .sheets import joined_sheets
+from .tetrahedra import are_inverted
+from .unresolved import describe
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,87 +84,23 @@ def repair_state(
     sheet = None if order is None else checked_sheets(order, count)
     distance = checked_distance(min_distance, "min_distance")
     strain = checked_number(max_strain, "max_strain", 0.0, above=True)
-    placed = ModelSurface(model, state, np.full(count, -1) if sheet is None else sheet, distance)
-    surface, weld = placed.surface, placed.weld
-    before = _Faults(placed, surface.home)
-    after = _repaired(placed, before, sheet, strain) if before else before
-    x = placed.positions(after.x)
+    surface = ModelSurface(model, state, distance)
+    if sheet is not None:
+        others = np.full(len(surface.home) - count, -1)
+        sheet = joined_sheets(np.append(sheet, others), surface.weld)
+    before, after, chosen = search(surface, strain, sheet=sheet)
+    x = surface.positions(after.x)
     if after is not before:
         assert state.particle_q is not None
         state.particle_q.assign(x[:count])
+    found = describe(surface, before, after, chosen, count)
+    tetrahedra = surface.tetrahedra
     return StateRepairResult(
+        **found,
         x=x[:count],
-        certified=not len(after.crossings) and not len(after.inside) and bool(np.isin(after.near, before.near).all()),
-        crossings_before=len(before.crossings),
-        crossings=len(after.crossings),
-        near_before=len(before.near),
-        near=len(after.near),
-        moved=(surface.moves(after.x)[weld] * surface.unit)[:count],
-        max_strain=surface.strain(after.x),
-        unresolved=unresolved_contours(surface, placed.mesh, weld, after.crossings),
-        order=None,
         inside_before=len(before.inside),
-        inside=after.inside,
-        inverted_before=before.inverted,
-        inverted=after.inverted,
-        mesh=placed.mesh,
+        inside=surface.particles_inside(after.x),
+        inverted_before=int(are_inverted(surface.detected(before.x), tetrahedra).sum()),
+        inverted=int(are_inverted(surface.detected(after.x), tetrahedra).sum()),
+        mesh=surface.given,
     )
-
-
-class _Faults:
-    """What is wrong with positions.
-
-    Attributes:
-        x: Positions, in units of the surface, shape [n, 3].
-        crossings: (edge, face) of the surface, shape [m, 2].
-        inside: Particles inside solids.
-        near: Pairs that are nearer than the minimum distance.
-        inverted: Number of inverted tetrahedra.
-    """
-
-    def __init__(self, placed: ModelSurface, x: np.ndarray):
-        """Finds them."""
-        self.x = x
-        self.crossings, self.inside = placed.crossings(x), placed.inside(x)
-        self.near = near_pairs(placed.surface, x)
-        self.inverted = int(are_inverted(placed.positions(x), placed.tetrahedra).sum())
-
-    def __bool__(self) -> bool:
-        """Whether there is anything to repair; inverted tetrahedra alone stay."""
-        return bool(len(self.crossings) or len(self.inside) or len(self.near))
-
-    @property
-    def counts(self) -> tuple[int, int]:
-        """Crossings and particles inside solids; pairs that are too near."""
-        return len(self.crossings) + len(self.inside), len(self.near)
-
-    def are_no_more(self, before: "_Faults") -> bool:
-        """Whether nothing is worse than before."""
-        are_fewer = len(self.crossings) <= len(before.crossings) and self.inverted <= before.inverted
-        return are_fewer and self.counts <= before.counts
-
-
-def _repaired(placed: ModelSurface, before: _Faults, sheet: np.ndarray | None, max_strain: float) -> _Faults:
-    """Returns the best positions that are found, the input if these are not better.
-
-    What is deep inside a solid may leave it only as a whole: that is tried if the way out of its particles is not free.
-    """
-    surface, best = placed.surface, before
-    start = surface.home if sheet is None else separate_sheets(surface, placed.sheet, surface.home)
-    for whole in (False, True) if len(before.inside) else (False,):
-        outside, movable = placed.leave_solids(start, whole=whole)
-        movable = movable if sheet is None else ~surface.fixed
-        x = free(surface, outside, surface.crossings(outside), max_strain, movable=movable)
-        if len(placed.tetrahedra):
-            x = restore_inverted(surface, follow_surface(surface, x, placed.tetrahedra), placed.tetrahedra)
-        found = _Faults(placed, x)
-        if found:
-            inside = placed.weld[before.inside.particles], placed.weld[found.inside.particles]
-            restored = _Faults(placed, restore_parts(surface, x, (before.crossings, found.crossings), inside))
-            if restored.are_no_more(before):
-                found = restored
-        if found.are_no_more(before) and found.counts < best.counts:
-            best = found
-        if not best:
-            break
-    return best

@@ -2,19 +2,26 @@
 
 import functools
 import time
+from collections.abc import Iterator
 
 import numpy as np
 import warp as wp
 
 from ..detection.detector import CollisionDetector
 from ..detection.mesh import CollisionMesh
+from .contours import connected_components
 
 _WRECKED = 0.25
 """Median strain of edges that have moved above which a surface is no result."""
+_REACH = 0.25
+"""Distance of pairs that a motion may bring together, in edges."""
+_NO_TETRAHEDRA = np.zeros((0, 4), dtype=int)
+_DIRECTION = np.array([0.48, 0.6, 0.64])
+"""A direction across which few vertices of a mesh lie."""
 
 
-def weld_borders(mesh: CollisionMesh, positions: np.ndarray, *labels: np.ndarray) -> np.ndarray:
-    """Returns for each vertex the first one that it is welded to, int, shape [n].
+def weld_borders(mesh: CollisionMesh, positions: np.ndarray, *labels: np.ndarray, tolerance: float = 0.0) -> np.ndarray:
+    """Returns for each vertex the one that it is welded to, which is welded to itself, int, shape [n].
 
     The two sides of a seam are borders whose vertices have the same positions, world, groups and mask. Vertices inside
     a surface are not welded: there, two surfaces touch.
@@ -23,16 +30,37 @@ def weld_borders(mesh: CollisionMesh, positions: np.ndarray, *labels: np.ndarray
         mesh: The mesh.
         positions: Positions of the vertices in one configuration or several, finite, shape [n, 3 k].
         labels: Only vertices of the same labels are welded, int, each of shape [n].
+        tolerance: Distance up to which positions count as the same, in each configuration.
     """
     weld = np.arange(len(positions))
     border = np.bincount(mesh.face_edges.ravel() + 1, minlength=len(mesh.edges) + 1)[1:] == 1
     vertices = np.unique(mesh.edges[border])
     if len(vertices):
         bits = [values for values in (mesh.world, mesh.group, mesh.mask) if values is not None]
-        keys = np.column_stack([values[vertices] for values in (positions, *labels, *bits)])
+        marks = [values[vertices] for values in (*labels, *bits)]
+        places = positions[vertices]
+        if tolerance:
+            places = connected_components(len(vertices), _pairs_within(places, marks, tolerance))
+        keys = np.column_stack([places, *marks])
         _, firsts, numbers = np.unique(keys, axis=0, return_index=True, return_inverse=True)
         weld[vertices] = vertices[firsts[numbers.reshape(-1)]]
     return weld
+
+
+def _pairs_within(places: np.ndarray, labels: list[np.ndarray], tolerance: float) -> np.ndarray:
+    """Returns the pairs of places of the same labels that are at most a distance apart, int, shape [m, 2]."""
+    along = (places[:, :3] - places[0, :3]).astype(np.float64) @ _DIRECTION
+    order = np.argsort(along)
+    reach = 1.01 * tolerance + 2.0**-48 * np.abs(along).max()  # with rounding
+    counts = np.searchsorted(along[order], along[order] + reach, side="right") - np.arange(len(order)) - 1
+    first = np.repeat(np.arange(len(order)), counts)
+    second = first + 1 + np.arange(len(first)) - np.repeat(np.cumsum(counts) - counts, counts)
+    pairs = np.stack([order[first], order[second]], axis=1)
+    ways = (places[pairs[:, 1]] - places[pairs[:, 0]]).reshape(len(pairs), -1, 3)
+    near = (np.linalg.norm(ways, axis=2) <= tolerance).all(axis=1)
+    for values in labels:
+        near &= values[pairs[:, 0]] == values[pairs[:, 1]]
+    return pairs[near]
 
 
 def welded(mesh: CollisionMesh, weld: np.ndarray) -> CollisionMesh:
@@ -61,15 +89,22 @@ def differ(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 class Surface:
     """A mesh without doubled vertices, the input, and what must stay. Positions are in units of its size.
 
+    An offset and a unit, a power of 2, are taken from the coordinates without rounding, so that what is decided of
+    positions in units holds for those of the input's type.
+
     Attributes:
+        given: The mesh as it was given.
+        weld: The vertex that each of its vertices is welded to, int, shape [n].
         mesh: The mesh, in which no face uses a doubled vertex.
         edges: Vertices of the edges of the mesh, then of the other edges of tetrahedra, int, shape [m, 2].
         ends: The first and the second vertices of the edges, shape [2, m].
+        tetrahedra: Vertices of tetrahedra, whose inner vertices follow, int, shape [m, 4].
         home: Input positions, in units, float64, shape [n, 3].
         fixed: Vertices that stay, and those that no element uses, bool, shape [n].
-        unit: The unit, a power of 2, in the unit of the input.
+        unit: The unit, in the unit of the input.
         lengths: Length of each of the edges in the input, in units, float64, shape [m].
         edge: Median length of the edges.
+        shortest: Length of the shortest edge of each vertex, at most the median, in units, float64, shape [n].
         min_distance: Distance that elements keep, in units, 0 for none.
         end: Time at which a search ends with what it has found, as of ``time.monotonic`` [s].
     """
@@ -83,8 +118,8 @@ class Surface:
         fixed: np.ndarray,
         min_distance: float = 0.0,
         *,
-        tetrahedra: np.ndarray | None = None,
-        counts_fixed: bool = True,
+        weld: np.ndarray | None = None,
+        tetrahedra: np.ndarray = _NO_TETRAHEDRA,
     ):
         """Prepares detection.
 
@@ -93,29 +128,34 @@ class Surface:
             x: Input positions, finite, float32 or float64, shape [n, 3].
             fixed: Vertices that stay, bool, shape [n].
             min_distance: Distance that elements keep, in the unit of the input.
-            tetrahedra: Vertices of tetrahedra, whose inner vertices follow, int, shape [m, 4]; default: none.
-            counts_fixed: Whether an edge and a face count as crossing if all of their vertices stay.
+            weld: The vertex that each vertex is welded to, int, shape [n]; default: itself.
+            tetrahedra: Vertices of tetrahedra, int, shape [m, 4]; default: none.
         """
-        self.mesh, self._dtype, self._counts_fixed = mesh, x.dtype, counts_fixed
-        self.edges = mesh.edges
+        self.weld = weld = np.arange(len(x)) if weld is None else weld
+        self.given, self.mesh, self._input = mesh, welded(mesh, weld), x
+        self.tetrahedra = weld[tetrahedra]
+        mesh, self.edges = self.mesh, self.mesh.edges
         is_used = np.zeros(len(x), dtype=bool)
         is_used[mesh.vertices] = True
-        if tetrahedra is not None and len(tetrahedra):
-            is_used[tetrahedra] = True
-            self.edges = _with_edges_of(tetrahedra, mesh.edges, len(x))
+        if len(tetrahedra):
+            is_used[self.tetrahedra] = True
+            self.edges = _with_edges_of(self.tetrahedra, mesh.edges, len(x))
         self.ends = np.ascontiguousarray(self.edges.T)
-        used = x[is_used].astype(np.float64)
-        size = float(np.max(used.max(axis=0) - used.min(axis=0))) if len(used) else 0.0
-        self.unit = 2.0 ** np.floor(np.log2(size)) if size > 0.0 else 1.0
-        self._input, self._is_used = x, is_used[:, None]
+        self._is_used = is_used[:, None]
+        self._offset, self.unit = _frame_of(x[is_used])
+        most = float(np.finfo(x.dtype).max)
+        # within a factor of 2 of the offset, differences from it are exact
+        ends = np.sort([self._offset / 2.0, self._offset * 2.0], axis=0)
+        self._ends = np.clip(np.where(self._offset == 0.0, [[-most], [most]], ends), -most, most)
         self.home = self.in_units(x)
         self.min_distance = min_distance / self.unit
-        self.fixed = fixed | ~is_used
+        self.fixed = (np.bincount(weld, fixed, len(x)) > 0) | ~is_used
         self.lengths = self._lengths_of(self.home, slice(None))
         self.edge = float(np.median(self.lengths)) if len(self.lengths) else 1.0
+        self.shortest = np.full(len(x), self.edge)
+        np.minimum.at(self.shortest, self.ends, np.broadcast_to(self.lengths, self.ends.shape))
         self.detector = CollisionDetector(mesh)
         self._finder = self.detector.intersection_finder()
-        self._placed: tuple[np.ndarray, np.ndarray] | None = None
 
     @functools.cached_property
     def device_edges(self) -> wp.array:
@@ -125,7 +165,12 @@ class Surface:
     @functools.cached_property
     def distance_detector(self) -> CollisionDetector:
         """A detector of pairs that come within the minimum distance."""
-        return CollisionDetector(self.mesh, min_distance=self.min_distance * self.unit)
+        return CollisionDetector(self.mesh, min_distance=self.min_distance)
+
+    @functools.cached_property
+    def reach_detector(self) -> CollisionDetector:
+        """A detector of pairs that a motion may bring together."""
+        return CollisionDetector(self.mesh, min_distance=max(_REACH * self.edge, 1.01 * self.min_distance))
 
     @property
     def is_late(self) -> bool:
@@ -134,7 +179,7 @@ class Surface:
 
     def in_units(self, x: np.ndarray) -> np.ndarray:
         """Returns positions in units, float64; 0 for vertices that are not used."""
-        return np.where(self._is_used, x, 0.0).astype(np.float64) / self.unit
+        return (np.where(self._is_used, x, self._offset).astype(np.float64) - self._offset) / self.unit
 
     def strain(self, x: np.ndarray) -> float:
         """Returns the largest change of the length of an edge, as a share of its length in the input."""
@@ -166,31 +211,40 @@ class Surface:
         return np.linalg.norm(x - self.home, axis=1)
 
     def positions(self, x: np.ndarray) -> np.ndarray:
-        """Returns positions in units as those of the input: of its type, with its bits where nothing has moved."""
-        if self._placed is None or self._placed[0] is not x:
-            self.rounded(x)
-        assert self._placed is not None
-        return self._placed[1]
+        """Returns rounded positions in units as those of the input: of its type, its bits where nothing has moved."""
+        moved = differ(x, self.home)[self.weld]
+        places = (x[self.weld] * self.unit + self._offset).astype(self._input.dtype)
+        return np.where(moved[:, None], places, self._input)
 
     def rounded(self, x: np.ndarray) -> np.ndarray:
-        """Returns positions in units as they will be returned, rounded to the type of the input.
-
-        Those that were rounded last are looked at next: their :meth:`positions` are kept, so they must not be changed.
-        """
-        rounded, positions = self.home.copy(), self._input.copy()
+        """Returns positions in units as they will be returned, rounded to the type of the input."""
+        rounded = self.home.copy()
         (rows,) = np.nonzero(differ(x, self.home))
-        with np.errstate(over="ignore"):
-            moved = (x[rows] * self.unit).astype(self._dtype)
-        stays = x[rows] == self.home[rows]
-        positions[rows] = np.where(stays, positions[rows], moved)
-        rounded[rows] = np.where(stays, rounded[rows], moved.astype(np.float64) / self.unit)
-        self._placed = rounded, positions
+        dtype = self._input.dtype
+        moved = np.clip(x[rows] * self.unit + self._offset, *self._ends).astype(dtype).astype(np.float64)
+        placed = ((moved - self._offset) / self.unit).astype(dtype).astype(np.float64)
+        rounded[rows] = np.where(x[rows] == self.home[rows], rounded[rows], placed)
         return rounded
 
     def crossings(self, x: np.ndarray) -> np.ndarray:
-        """Returns the edges that meet faces at positions in units, exactly, as returned: (edge, face), shape [n, 2]."""
-        pairs = self._finder.find(self.positions(x)).pairs
-        return pairs if self._counts_fixed else pairs[~self.are_fixed(pairs)]
+        """Returns the edges that meet faces at rounded positions in units, exactly: (edge, face), shape [n, 2]."""
+        return self._finder.find(self.detected(x)).pairs
+
+    def detected(self, x: np.ndarray) -> np.ndarray:
+        """Returns rounded positions in units in the type of the input, without a change."""
+        return x.astype(self._input.dtype, copy=False)
+
+    def counted(self, crossings: np.ndarray) -> np.ndarray:
+        """Returns the crossings that count as faults: all."""
+        return crossings
+
+    def inside(self, x: np.ndarray) -> np.ndarray:
+        """Returns the vertices inside solids at positions in units, int: a mesh alone has none."""
+        return np.zeros(0, dtype=int)
+
+    def starts(self, x: np.ndarray, movable: np.ndarray | None) -> Iterator[tuple[np.ndarray, np.ndarray | None]]:
+        """Yields positions in units from which a search may begin, and vertices that may move in each."""
+        yield x, movable
 
     def are_fixed(self, crossings: np.ndarray) -> np.ndarray:
         """Returns whether all vertices of edges and faces that cross are fixed, bool, shape [m]."""
@@ -205,6 +259,25 @@ class Surface:
     def array(self, values: np.ndarray, dtype: type = wp.vec3d) -> wp.array:
         """Returns an array on the device."""
         return wp.array(values, dtype=dtype, device=self.device)
+
+
+def _frame_of(x: np.ndarray) -> tuple[np.ndarray, float]:
+    """Returns an offset, shape [3], and a unit, a power of 2, that positions lose no bit by: else 0 and 1.
+
+    Args:
+        x: Positions, float32 or float64, shape [n, 3].
+    """
+    unchanged = np.zeros(3), 1.0
+    if not len(x):
+        return unchanged
+    low, high = x.min(axis=0).astype(np.float64), x.max(axis=0).astype(np.float64)
+    nearest, farthest = np.sort(np.abs([low, high]), axis=0)
+    # differences of numbers within a factor of 2 are exact (Sterbenz 1974)
+    offset = np.where((np.sign(low) == np.sign(high)) & (farthest <= 1.5 * nearest), low, 0.0)
+    size = float(np.max(high / 2.0 - low / 2.0))
+    unit = 2.0 ** min(np.floor(np.log2(size)) + 1.0, 1023.0) if size > 0.0 else 1.0
+    placed = ((x - offset) / unit).astype(x.dtype)
+    return (offset, unit) if (placed.astype(np.float64) * unit == x - offset).all() else unchanged
 
 
 def _with_edges_of(tetrahedra: np.ndarray, edges: np.ndarray, count: int) -> np.ndarray:

@@ -35,36 +35,25 @@ def are_inverted(x: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
     return inverted
 
 
-def follow_surface(surface: Surface, x: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
-    """Returns positions at which the inner vertices of tetrahedra move as those around them move.
+def follow_surface(surface: Surface, x: np.ndarray) -> np.ndarray:
+    """Returns positions at which the inner vertices of tetrahedra move as those around them move, and none inverts.
+
+    A part with tetrahedra that have inverted, connected by vertices that have moved, is as in the input.
 
     Args:
         surface: The surface.
-        x: Positions, in units, shape [n, 3]. Vertices of the surface keep them.
-        tetrahedra: Vertices of the tetrahedra, int, shape [m, 4].
+        x: Positions, in units, shape [n, 3]. Vertices of the surface keep them, unless their part does not.
     """
+    tetrahedra = surface.tetrahedra
     is_inner = np.zeros(len(x), dtype=bool)
     is_inner[tetrahedra] = True
     is_inner[surface.mesh.vertices] = False
     is_inner &= ~surface.fixed
-    moves = np.where(is_inner[:, None], 0.0, x - surface.home)
-    spread = Springs(surface, is_inner).spread(moves, ~is_inner, _SWEEPS)
-    return surface.rounded(np.where(is_inner[:, None], surface.home + spread, x))
-
-
-def restore_inverted(surface: Surface, x: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
-    """Returns positions in which parts with tetrahedra that have inverted are as in the input.
-
-    A part is connected by vertices that have moved.
-
-    Args:
-        surface: The surface.
-        x: Positions, in units, shape [n, 3].
-        tetrahedra: Vertices of the tetrahedra, int, shape [m, 4].
-    """
-    inverted = are_inverted(surface.positions(x), tetrahedra) & ~are_inverted(
-        surface.positions(surface.home), tetrahedra
-    )
+    if is_inner.any():
+        moves = np.where(is_inner[:, None], 0.0, x - surface.home)
+        spread = Springs(surface, is_inner).spread(moves, ~is_inner, _SWEEPS)
+        x = surface.rounded(np.where(is_inner[:, None], surface.home + spread, x))
+    inverted = are_inverted(surface.detected(x), tetrahedra) & ~are_inverted(surface.detected(surface.home), tetrahedra)
     if not inverted.any():
         return x
     moved = differ(x, surface.home)

@@ -13,7 +13,7 @@ from .text import not_finite_warning, revoked_warning, set_bodies_warning, shape
 
 _CROSSINGS = (
     "edges pass through faces at the start of a step, and their contacts are delegated to the solver: "
-    "warp_bsc.repair_state(model, state) moves them apart before the first step"
+    "warp_bsc.repair_state(model, state) moves them apart before the first step, or names in its result what remains"
 )
 _INVERSIONS = (
     "a step inverted tetrahedra, report.inverting counts those of the last one: take shorter steps, or pass "

@@ -147,7 +147,7 @@ def line_of(report: Any) -> str:
         line += f", {totals.inverting_steps} that inverted tetrahedra"
     if report.crossings:
         line += f", {report.crossings} crossings at the start of the step"
-        line += " (warp_bsc.repair_state removes those of a first step)"
+        line += " (warp_bsc.repair_state removes those of a first step, or names them)"
     if inside:
         line += f", {inside} particles inside solids"
     if totals.remaining or totals.excluded:
