@@ -5,7 +5,7 @@
 
 In each world something is thrown in another way. The loss is a weighted mean of the positions at the end; its gradient
 is with respect to the velocity of the throw. A world deviates by the largest difference of its three components from
-those of central differences, as a share of the largest of these. Two comparisons, and two that tell the first two apart:
+those of central differences, as a share of the largest of these. Two comparisons, and two that tell why they differ:
 
 - "exact": the adjoint of steps in float64, solved until nothing is left, with central differences of the same steps,
   see ``gradient_reference.py``, at 1e-4 m/s. A world passes within 1%, and within 5% in each component that is more
@@ -264,9 +264,9 @@ def judge(name, worlds, steps, dt, device):
     passes = (off <= 0.01) & (of_each <= 0.05) & ~unsolved
     row |= {"exact": float(passes.mean()), "median": float(np.median(off)), "unsolved": int(unsolved.sum())}
     row["exact_deviations"] = off.tolist()
-    for name in ("longer", "loads"):
-        off, _ = deviations(gradients, found[name])
-        row |= {name: float((off <= 0.1).mean()), f"{name}_deviations": off.tolist()}
+    for kind in ("longer", "loads"):
+        off, _ = deviations(gradients, found[kind])
+        row |= {kind: float((off <= 0.1).mean()), f"{kind}_deviations": off.tolist()}
     gradients, found = run_as_computed(scene, steps)
     off, _ = deviations(gradients, found)
     is_nan = ~np.isfinite(gradients).all(axis=1)

@@ -37,7 +37,7 @@ class RepairRun:
         unrepaired_pairs: Pairs of meshes that stay as they are.
         stretches: The stretches, without their frames.
         frames: Times and numbers of moved vertices of the moved frames, by stretch.
-        distorted: Smallest and largest lengths of edges in frames that are not good, by time, see :class:`RepairedStretch`.
+        distorted: Smallest and largest lengths of edges in frames that are not good, by time.
         earlier: Number of stretches of an earlier run.
         seconds: Times to find and to repair [s].
         interrupt: The signal that ended it.

@@ -65,7 +65,7 @@ def untangle(surface: Surface, x: np.ndarray, crossings: np.ndarray) -> Untangle
     springs = Springs(surface, inner)
     best, since, iteration = Untangled(x, crossings, springs), 0, 0
     while not surface.are_fixed(crossings).all() and since < _PATIENCE and not surface.is_late:
-        vertices = _vertices_of(surface, crossings)
+        vertices = np.hstack([surface.mesh.edges[crossings[:, 0]], surface.mesh.faces[crossings[:, 1]]]).ravel()
         if not inner[vertices].all():
             inner = inner | within(surface, vertices, _MORE_RINGS)
             springs = Springs(surface, near(surface, inner, _RINGS))
@@ -80,11 +80,6 @@ def untangle(surface: Surface, x: np.ndarray, crossings: np.ndarray) -> Untangle
         if len(crossings) < len(best.crossings):
             best, since = Untangled(x, crossings, springs), 0
     return best
-
-
-def _vertices_of(surface: Surface, crossings: np.ndarray) -> np.ndarray:
-    """Returns the vertices of edges and faces that cross, with repetitions, int, shape [5 m]."""
-    return np.hstack([surface.mesh.edges[crossings[:, 0]], surface.mesh.faces[crossings[:, 1]]]).ravel()
 
 
 def _contour_moves(

@@ -139,7 +139,8 @@ class ReportPage(RecordFile):
         indices, elements = pairs.indices[rows], pairs.elements[rows]
         meshes = numbers[pairs.meshes[rows]] if len(rows) else pairs.meshes[rows]
         columns = (meshes[:, 0], meshes[:, 1], 4 * elements[:, 0] + elements[:, 1], *indices.reshape(-1, 4).T)
-        return dict(zip(_COLUMNS, columns, strict=True)) | {"position": self._placed(pairs.position[rows])}
+        position = self._from_center(pairs.position[rows]).astype(np.float32)
+        return dict(zip(_COLUMNS, columns, strict=True)) | {"position": position}
 
     def _new(self, what: Event, pairs: ScenePairs, rows: np.ndarray, start: float, end: float) -> dict[str, np.ndarray]:
         """Returns the array that says which rows are not in the baseline; nothing without a baseline."""
@@ -221,10 +222,6 @@ class ReportPage(RecordFile):
         """Returns positions relative to the page's center."""
         assert self._center is not None  # since the first interval
         return positions.astype(np.float64) - self._center
-
-    def _placed(self, positions: np.ndarray) -> np.ndarray:
-        """Returns positions relative to the page's center, in single precision."""
-        return self._from_center(positions).astype(np.float32)
 
     def _notes(self, summary: Summary, rows: list[tuple[int, int, int]]) -> list[str]:
         """Returns sentences on what the page omits."""

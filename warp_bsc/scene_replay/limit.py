@@ -5,7 +5,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from .results import IntersectionSummary, IntervalResult
+from .results import IntervalResult
 from .scene_contacts import SceneContacts
 from .scene_intersections import SceneIntersections
 from .scene_proximities import SceneProximities
@@ -86,16 +86,11 @@ def not_listed(summary: Summary, *, with_end: bool) -> NotListed | None:
     count = len(summary.intersections or summary.proximities) if with_end else len(summary.intervals)
     lists = (
         [interval.hits for interval in summary.intervals],
-        [number for at in summary.intersections[:count] for number in _counts(at)],
+        [n for at in summary.intersections[:count] for n in (at.crossings + at.touches, sum(at.inside.values()))],
         [at.pairs for at in summary.proximities[:count]],
     )
     numbers = [(sum(max(0, rows - summary.limit) for rows in found), sum(found)) for found in lists]
     return NotListed(summary.limit, *numbers)
-
-
-def _counts(at: IntersectionSummary) -> tuple[int, int]:
-    """Returns the numbers of edges that meet faces and of parts inside others."""
-    return at.crossings + at.touches, sum(at.inside.values())
 
 
 def _limit_intersections(found: SceneIntersections, limit: int) -> SceneIntersections:

@@ -55,7 +55,8 @@ def simulate_mujoco(
     if not hasattr(mujoco.mjtEnableBit, "mjENBL_IPC"):
         raise NotInstalled(f"MuJoCo {mujoco.__version__} has no ipc contact: it needs 3.14 or later")
     scene, start = built.scene, host_array(built.scene.model.particle_q).astype(np.float64)
-    model = mujoco.MjModel.from_xml_string(make_mujoco_xml(scene.model, set(_held(built)), rate))
+    held, _ = held_positions(scene.motion, 0.0)
+    model = mujoco.MjModel.from_xml_string(make_mujoco_xml(scene.model, set(held.tolist()), rate))
     data = mujoco.MjData(model)
     addresses = {
         int(name[1:]): int(model.jnt_qposadr[model.body_jntadr[body]])
@@ -65,7 +66,6 @@ def simulate_mujoco(
     moving = np.array(list(addresses))
     rows = np.array(list(addresses.values()))[:, None] + np.arange(3)
     data.qvel[rows] = host_array(scene.model.particle_qd)[moving]
-    held, _ = held_positions(scene.motion, 0.0)
     held_rows = np.array([addresses[particle] for particle in held], dtype=int)[:, None] + np.arange(3)
     steps = round(seconds * rate)
     states, milliseconds = [start], []
@@ -110,10 +110,6 @@ def make_mujoco_xml(model: newton.Model, held: set[int], rate: int) -> str:
         '<flag ipc="enable" autoreset="disable"/></option><size memory="1G"/>'
         f"<worldbody>{_shapes_xml(model)}{points}</worldbody><deformable>{flexes}</deformable></mujoco>"
     )
-
-
-def _held(built: PenetrationScene) -> list[int]:
-    return held_positions(built.scene.motion, 0.0)[0].tolist()
 
 
 def _point_xml(number: int, at: np.ndarray, mass: float) -> str:

@@ -1,10 +1,12 @@
 """What simulators of ``warp-bsc bench penetration`` return, and what they read of a scene: meshes and stiffness."""
 
 from dataclasses import dataclass
+from itertools import combinations
 
 import newton
 import numpy as np
 
+from ...repairing.contours import connected_components
 from ...response.state.mesh import host_array
 from ..scenes.contact import Motion
 
@@ -73,15 +75,10 @@ def find_bodies(model: newton.Model) -> list[Body]:
         np.zeros((0, n), dtype=int) if indices is None else host_array(indices).reshape(-1, n).astype(int)
         for indices, n in ((model.tri_indices, 3), (model.tet_indices, 4))
     )
-    label = np.arange(model.particle_count)
-    pairs = np.concatenate([elements[:, [i, j]] for elements in (triangles, tets) for i, j in _sides(elements)])
-    while True:  # the least number of each component spreads
-        least = label.copy()
-        np.minimum.at(least, pairs[:, 0], label[pairs[:, 1]])
-        np.minimum.at(least, pairs[:, 1], label[pairs[:, 0]])
-        if (least == label).all():
-            break
-        label = least
+    pairs = np.concatenate(
+        [elements[:, [i, j]] for elements in (triangles, tets) for i, j in combinations(range(elements.shape[1]), 2)]
+    )
+    label = connected_components(model.particle_count, pairs)
     bodies = []
     for first in np.unique(label[pairs]):
         particles = np.flatnonzero(label == first)
@@ -96,11 +93,6 @@ def find_bodies(model: newton.Model) -> list[Body]:
             elements, area, volume = faces, float(host_array(model.tri_areas)[of_triangles].sum()), 0.0
         bodies.append(Body(particles, elements, faces, float(mu), float(lam), area, volume))
     return bodies
-
-
-def _sides(elements: np.ndarray) -> list[tuple[int, int]]:
-    n = elements.shape[1]
-    return [(i, j) for i in range(n) for j in range(i)]
 
 
 def held_positions(motion: Motion | None, t: float) -> tuple[np.ndarray, np.ndarray]:

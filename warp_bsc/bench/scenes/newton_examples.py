@@ -89,7 +89,8 @@ def _read_example(name: str, module: str, options: tuple[str, ...] = ()) -> Newt
     specification = importlib.util.find_spec(module)
     assert specification is not None and specification.origin is not None
     tree = ast.parse(Path(specification.origin).read_text(encoding="utf-8"))
-    calls = [(_called_name(node), node) for node in ast.walk(tree) if isinstance(node, ast.Call)]
+    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
+    calls = [(getattr(call.func, "attr", getattr(call.func, "id", "")), call) for call in calls]
     deformable = any(called.startswith(_BUILDERS) for called, _ in calls)
     downloads = dict.fromkeys(_first_string(node) for called, node in calls if called in _DOWNLOADS)
     imported = []
@@ -101,10 +102,6 @@ def _read_example(name: str, module: str, options: tuple[str, ...] = ()) -> Newt
     packages = dict.fromkeys(name.split(".")[0] for name in imported)
     missing = [package for package in packages if importlib.util.find_spec(package) is None]
     return NewtonExample(name, module, options, deformable, tuple(downloads), tuple(missing))
-
-
-def _called_name(call: ast.Call) -> str:
-    return getattr(call.func, "attr", getattr(call.func, "id", ""))
 
 
 def _first_string(call: ast.Call) -> str:

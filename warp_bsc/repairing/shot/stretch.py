@@ -55,7 +55,6 @@ class RepairedStretch:
         return {frame.time: ends for frame, ends in rows if ends[0] < _GOOD_EDGES[0] or ends[1] > _GOOD_EDGES[1]}
 
 
-
 @dataclass(frozen=True, eq=False)
 class ShotFrame:
     """A frame of a stretch: the shot, the positions that follow it, and what was added to it.
