@@ -13,7 +13,8 @@ from .text import not_finite_warning, revoked_warning, set_bodies_warning, shape
 
 _CROSSINGS = (
     "edges pass through faces at the start of a step, and their contacts are delegated to the solver: "
-    "warp_bsc.repair_state(model, state) moves them apart before the first step, or names in its result what remains"
+    "warp_bsc.repair_state(model, state) moves them apart before the first step; where it has not, its result names in "
+    "unresolved what remains and why, and its arguments order and max_strain let it move more"
 )
 _INVERSIONS = (
     "a step inverted tetrahedra, report.inverting counts those of the last one: take shorter steps, or pass "
