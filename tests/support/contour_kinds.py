@@ -13,6 +13,7 @@ import sys
 import time
 
 import numpy as np
+import warp as wp
 
 import warp_bsc as bsc
 
@@ -113,6 +114,7 @@ KINDS = {
 
 def main():
     """Prints the table."""
+    wp.config.log_level = wp.LOG_WARNING
     print("kind | vertices | crossings | certified | strain | largest, mean move | time")
     for size in map(int, sys.argv[1:] or (20, 60, 200)):
         for kind, make in KINDS.items():
