@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import trimesh
 from dipping import FRAMES, HIT, SIZE, dipping_sheet, points_of, quads, repaired, sheet
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel
 from replay_files import Page
@@ -141,6 +142,21 @@ def test_meshes_that_cross_at_first_are_left_and_named(tmp_path, capsys):
     capsys.readouterr()
     assert main(command) == 1
     assert "It leaves 1 pair of meshes that cross at the first time" in capsys.readouterr().out
+
+
+def test_replay_names_bodies_for_a_repair_to_keep(tmp_path, capsys):
+    """Bodies are closed: where a sheet crosses one at first, the sheet alone is to move. Sheets alone get no hint."""
+    stage, ball = dipping_sheet(tmp_path, dip=0.0), trimesh.creation.icosphere(2, 0.2)
+    points = {time: (ball.vertices * (1.0 + 1e-3 * (time % 2)) + [0.0, 0.0, 0.28]).tolist() for time in range(FRAMES)}
+    add_mesh(stage, "/World/Ball", points, [3] * len(ball.faces), ball.faces.ravel().tolist())
+    assert main(["replay", save(stage), "--device", "cpu"]) == 0
+    assert "With --keep /World/Ball bodies stay where they are" in capsys.readouterr().out
+    output = repaired(stage, "--include-initial", "--keep", "/World/Ball", "--fail-on", "remaining")
+    assert np.array_equal(points_of(output, 3, "/World/Ball"), np.float32(points[3]))
+    assert not np.array_equal(points_of(output, 3), sheet(0.103))
+    (tmp_path / "open").mkdir()
+    assert main(["replay", save(overlapping_sheets(tmp_path / "open")), "--device", "cpu"]) == 0
+    assert "It leaves 1 pair" in (printed := capsys.readouterr().out) and "--keep" not in printed
 
 
 def test_ignored_meshes_are_not_kept_apart(tmp_path, capsys):

@@ -104,8 +104,8 @@ def print_repair(console: Console, summary: Summary, command: str) -> None:
     say(console, f"To repair: {command}")
     start = summary.intersections[0].mesh_pairs if summary.intersections else {}
     crossing = [pair for pair, (crosses, _) in start.items() if crosses and pair[0] != pair[1]]
-    kept = kept_meshes(summary.scene).keys() if crossing else ()
-    if left := [pair for pair in crossing if not kept >= {*pair}]:
+    kept = set(kept_meshes(summary.scene) if crossing else ())
+    if left := [pair for pair in crossing if not kept.issuperset(pair)]:
         pairs = count(len(left), "pair")
         say(console, f"  It leaves {pairs} of meshes that cross at the first time; --include-initial repairs them too.")
         closed = closed_meshes(summary.scene)
