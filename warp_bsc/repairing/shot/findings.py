@@ -90,11 +90,11 @@ def kept_meshes(scene: Scene, keep: Iterable[str] = ()) -> dict[str, str]:
 def closed_meshes(scene: Scene) -> set[str]:
     """Returns the names of the meshes without a border at the first time, which are bodies rather than cloth."""
     segment = scene.segment(0)
-    sides = np.sort(segment.faces[:, [[0, 1], [1, 2], [2, 0]]], axis=2).reshape(-1, 2)
+    low, high = np.sort(segment.faces[:, [[0, 1], [1, 2], [2, 0]]], axis=2).reshape(-1, 2).astype(np.int64).T
     mesh = np.repeat(segment.locate_faces(np.arange(len(segment.faces)))[0], 3)
-    found, count = np.unique(np.column_stack([mesh, sides]), axis=0, return_counts=True)
-    closed = np.setdiff1d(mesh, found[count == 1, 0])
-    return {segment.meshes[number].name for number in closed}
+    edges, edge = np.unique(low * segment.vertex_count + high, return_inverse=True)
+    sides, count = np.unique(mesh * len(edges) + edge, return_counts=True)  # of one mesh: two may share a seam
+    return {segment.meshes[n].name for n in np.setdiff1d(mesh, sides[count == 1] // max(1, len(edges)))}
 
 
 def find_collisions(
