@@ -13,9 +13,9 @@ from .._atomic_file import OutputFile
 from ..usd.segment import Segment
 from .limit import not_listed
 from .outputs import ReplayOutput, without_last_eighth
-from .results import IntervalResult
+from .results import AnyPairs, IntervalResult
 from .scene_contacts import SceneContacts
-from .scene_pairs import ALL_PHASES, ELEMENT_WORDS, KINDS, ScenePairs
+from .scene_pairs import ALL_PHASES, ELEMENT_WORDS, KINDS
 from .scene_proximities import SceneProximities
 from .summary import Summary
 
@@ -79,13 +79,8 @@ class HitsNpz(ReplayOutput):
     def add(self, result: IntervalResult) -> None:
         """Appends the rows of an interval."""
         interval = result.summary
-        times = 2 if interval.index == self._last and interval.end > interval.start else 1
-        parts = [self._rows_of_contacts(result.contacts)]
-        for toi, pairs in enumerate((result.intersections or ())[:times]):
-            parts.append(self._rows_of(pairs, pairs.phase, toi))
-        for toi, pairs in enumerate((result.proximities or ())[:times]):
-            parts.append(self._rows_of_proximities(pairs, toi))
-        rows = np.concatenate(parts)
+        all_pairs = result.pairs(is_last=interval.index == self._last)
+        rows = np.concatenate([self._rows_of(pairs, interval.start) for pairs in all_pairs])
         rows["interval"] = len(self._ends)
         before = self._ends[-1] if self._ends else 0
         self._rows.seek(before * _ROW.itemsize)
@@ -143,22 +138,19 @@ class HitsNpz(ReplayOutput):
             size = min(_ROWS_AT_ONCE, rows - first) * _ROW.itemsize
             member.write(np.ascontiguousarray(np.frombuffer(self._rows.read(size), _ROW)[name]).tobytes())
 
-    def _rows_of(self, pairs: ScenePairs, phase, toi) -> np.ndarray:
+    def _rows_of(self, pairs: AnyPairs, start: float) -> np.ndarray:
+        """Returns the rows of pairs of an interval that starts at a time."""
         rows = np.zeros(len(pairs), dtype=_ROW)
-        rows["kind"], rows["phase"], rows["toi"] = pairs.kind, phase, toi
         rows["element"], rows["index"], rows["position"] = pairs.elements, pairs.indices, pairs.position
-        rows["mesh"] = self._numbers(pairs.segment, pairs.meshes)
-        return rows
-
-    def _rows_of_contacts(self, contacts: SceneContacts) -> np.ndarray:
-        phase = np.full(len(contacts), -1) if contacts.phase is None else contacts.phase
-        rows = self._rows_of(contacts, np.where(phase < 0, len(ALL_PHASES), phase), contacts.toi)
-        rows["normal"] = np.rint(_NORMAL_UNIT * contacts.normal)
-        return rows
-
-    def _rows_of_proximities(self, proximities: SceneProximities, toi: int) -> np.ndarray:
-        rows = self._rows_of(proximities, proximities.phase, toi)
-        rows["distance"] = proximities.distance
+        rows["kind"], rows["mesh"] = pairs.kind, self._numbers(pairs.segment, pairs.meshes)
+        phase = np.full(len(pairs), -1) if pairs.phase is None else pairs.phase
+        rows["phase"] = np.where(phase < 0, len(ALL_PHASES), phase)
+        if isinstance(pairs, SceneContacts):
+            rows["toi"], rows["normal"] = pairs.toi, np.rint(_NORMAL_UNIT * pairs.normal)
+        else:
+            rows["toi"] = pairs.time > start
+        if isinstance(pairs, SceneProximities):
+            rows["distance"] = pairs.distance
         return rows
 
     def _numbers(self, segment: Segment, meshes: np.ndarray) -> np.ndarray:

@@ -5,9 +5,9 @@ import io
 import math
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import orjson
@@ -18,10 +18,9 @@ from ..usd.scene import Scene
 from .hit_records import head_line, interval_line, kind_words, phase_words, tail_line
 from .limit import not_listed
 from .outputs import RecordFile
-from .results import IntervalResult
+from .results import AnyPairs, IntervalResult
 from .scene_contacts import SceneContacts
-from .scene_intersections import SceneIntersections
-from .scene_pairs import ELEMENT_WORDS, ScenePairs
+from .scene_pairs import ELEMENT_WORDS
 from .scene_proximities import SceneProximities
 from .summary import CERTIFIED_FOR, Summary
 from .summary_records import mesh_pairs_to_list, with_numbers
@@ -178,14 +177,10 @@ class HitsCsv(RecordFile):
 
     def record(self, result: IntervalResult) -> Iterator[str]:
         """Yields the rows of an interval."""
-        interval, contacts = result.summary, result.contacts
+        interval = result.summary
         where = f"{interval.index},{interval.start},{interval.end}"
-        times = 2 if interval.index == self._last_index and interval.end > interval.start else 1
-        yield from _csv_rows(where, contacts, _contact_columns)
-        for intersections in (result.intersections or ())[:times]:
-            yield from _csv_rows(where, intersections, _columns_at_rest)
-        for proximities in (result.proximities or ())[:times]:
-            yield from _csv_rows(where, proximities, _columns_at_rest)
+        for pairs in result.pairs(is_last=interval.index == self._last_index):
+            yield from _csv_rows(where, pairs)
 
     def tail(self, summary: Summary) -> str:
         """Returns lines on rows that a limit leaves out, missing intervals and parts that are left out, if any are."""
@@ -198,28 +193,20 @@ class HitsCsv(RecordFile):
         return lines
 
 
-_Pairs = TypeVar("_Pairs", bound=ScenePairs)
+def _csv_rows(where: str, pairs: AnyPairs) -> Iterator[str]:
+    """Yields rows of a CSV file, given the text of the columns of the interval.
 
-
-def _csv_rows(
-    where: str, pairs: _Pairs, to_columns: Callable[[_Pairs, slice], tuple[list[str], list[str], list[str]]]
-) -> Iterator[str]:
-    """Yields rows of a CSV file. Their texts are made column by column, many times faster than value by value.
-
-    Args:
-        where: Text of the columns of the interval.
-        pairs: The pairs.
-        to_columns: Returns texts of some pairs: kind, columns from the time to the normal, columns from the phase on.
+    Their texts are made column by column, many times faster than value by value.
     """
     meshes = pairs.segment.meshes
     names = {mesh: _csv_text(meshes[mesh].name, meshes[mesh].path) for mesh in np.unique(pairs.meshes).tolist()}
     for rows in pairs.chunks():
         first, second = (_csv_sides(pairs, rows, side, names) for side in range(2))
-        columns = zip(*to_columns(pairs, rows), first, second, strict=True)
+        columns = zip(kind_words(pairs, rows), *_csv_measures(pairs, rows), first, second, strict=True)
         yield "".join([f"{where},{kind},{a},{b},{measures},{end}\n" for kind, measures, end, a, b in columns])
 
 
-def _csv_sides(pairs: ScenePairs, rows: slice, side: int, names: dict[int, str]) -> list[str]:
+def _csv_sides(pairs: AnyPairs, rows: slice, side: int, names: dict[int, str]) -> list[str]:
     """Returns the columns of one side of some pairs: mesh and prim, by mesh, then element, and one or two indices."""
     columns = pairs.meshes[rows, side], pairs.elements[rows, side], *pairs.indices[rows, side].T
     return [
@@ -230,25 +217,17 @@ def _csv_sides(pairs: ScenePairs, rows: slice, side: int, names: dict[int, str])
     ]
 
 
-def _contact_columns(contacts: SceneContacts, rows: slice) -> tuple[list[str], list[str], list[str]]:
-    """Returns texts of some contacts, as :func:`_csv_rows` takes them."""
-    kinds = kind_words(contacts, rows)
-    measures = _numbers_to_csv(contacts.time[rows], contacts.toi[rows], contacts.position[rows], contacts.normal[rows])
-    ends = [",,"] * len(kinds)
-    if contacts.phase is not None and contacts.separate is not None:
-        phases = zip(phase_words(contacts, rows), contacts.separate[rows].tolist(), strict=True)
-        ends = [f"{phase},{separate}," if phase else ",," for phase, separate in phases]
-    return kinds, measures, ends
-
-
-def _columns_at_rest(
-    pairs: SceneIntersections | SceneProximities, rows: slice
-) -> tuple[list[str], list[str], list[str]]:
-    """Returns texts of some pairs without a time of impact and a normal, as :func:`_csv_rows` takes them."""
+def _csv_measures(pairs: AnyPairs, rows: slice) -> tuple[list[str], list[str]]:
+    """Returns texts of some pairs: the columns from the time to the normal, and those from the phase on."""
+    if isinstance(pairs, SceneContacts):
+        measures = _numbers_to_csv(pairs.time[rows], pairs.toi[rows], pairs.position[rows], pairs.normal[rows])
+        if pairs.phase is None or pairs.separate is None:
+            return measures, [",,"] * len(measures)
+        phases = zip(phase_words(pairs, rows), pairs.separate[rows].tolist(), strict=True)
+        return measures, [f"{phase},{separate}," if phase else ",," for phase, separate in phases]
     measures = [f"{pairs.time},,{point},,," for point in _numbers_to_csv(pairs.position[rows])]
     distances = _numbers_to_csv(pairs.distance[rows]) if isinstance(pairs, SceneProximities) else [""] * len(measures)
-    ends = [f"{phase},,{distance}" for phase, distance in zip(phase_words(pairs, rows), distances, strict=True)]
-    return kind_words(pairs, rows), measures, ends
+    return measures, [f"{phase},,{at}" for phase, at in zip(phase_words(pairs, rows), distances, strict=True)]
 
 
 def _numbers_to_csv(*columns: np.ndarray) -> list[str]:

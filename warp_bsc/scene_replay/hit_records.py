@@ -12,7 +12,7 @@ import numpy as np
 import orjson
 
 from ..usd.interval import Interval
-from .results import IntervalResult
+from .results import AnyPairs, IntervalResult
 from .scene_contacts import SceneContacts
 from .scene_intersections import SceneIntersections
 from .scene_pairs import ALL_PHASES, DIAGONAL, EDGE, ELEMENT_WORDS, FACE, KINDS, PHASES, ScenePairs
@@ -104,7 +104,7 @@ def kind_words(pairs: ScenePairs, rows: slice) -> list[str]:
     return [KINDS[kind] for kind in pairs.kind[rows].tolist()]
 
 
-def phase_words(pairs: SceneContacts | SceneIntersections | SceneProximities, rows: slice) -> list[str | None]:
+def phase_words(pairs: AnyPairs, rows: slice) -> list[str | None]:
     """Returns the phases of some pairs, in words; None where a pair has none."""
     assert pairs.phase is not None
     return [ALL_PHASES[phase] if phase >= 0 else None for phase in pairs.phase[rows].tolist()]
@@ -143,26 +143,12 @@ _COMPARISON = (
 )
 """The fields that contacts have as well if they are compared with the intersections."""
 
-_INTERSECTIONS = (
-    _KIND,
-    *_ELEMENTS,
-    _TIME,
-    _POSITION,
-    Column(
-        "phase",
-        phase_words,
-        "crosses",
-        lambda values: np.array([phase == "crosses" for phase in values], dtype=bool),
-    ),
+_AT_REST = (_KIND, *_ELEMENTS, _TIME, _POSITION)
+_CROSSES = Column(
+    "phase", phase_words, "crosses", lambda phases: np.array([phase == "crosses" for phase in phases], bool)
 )
-_PROXIMITIES = (
-    _KIND,
-    *_ELEMENTS,
-    _TIME,
-    _POSITION,
-    Column("phase", phase_words),
-    _numbers("distance"),
-)
+_INTERSECTIONS = (*_AT_REST, _CROSSES)
+_PROXIMITIES = (*_AT_REST, Column("phase", phase_words), _numbers("distance"))
 
 
 def _write_pairs(

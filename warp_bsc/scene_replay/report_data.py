@@ -194,16 +194,12 @@ def _pair(
     spans: tuple[tuple[str, str], list, list, list], hits: int, depth: tuple[float, float] | None, new: list
 ) -> dict:
     meshes, collisions, at_rest, near = spans
-    return {
-        "meshes": meshes,
-        "hits": hits,
-        "depth": depth,
-        "spans": collisions[:_MAX_ROWS],
-        "more": max(0, len(collisions) - _MAX_ROWS),
-        "rest": at_rest[:_MAX_ROWS],
-        "more_rest": max(0, len(at_rest) - _MAX_ROWS),
-        "near": near[:_MAX_ROWS],
-        "more_near": max(0, len(near) - _MAX_ROWS),
-        "new": new[:_MAX_ROWS],
-        "more_new": max(0, len(new) - _MAX_ROWS),
-    }
+    pair: dict = {"meshes": meshes, "hits": hits, "depth": depth}
+    for name, more, rows in (
+        ("spans", "more", collisions),
+        ("rest", "more_rest", at_rest),
+        ("near", "more_near", near),
+        ("new", "more_new", new),
+    ):
+        pair |= {name: rows[:_MAX_ROWS], more: max(0, len(rows) - _MAX_ROWS)}
+    return pair

@@ -22,6 +22,10 @@ TOI_BINS = 20
 """Number of equal parts of an interval in which times of impact are counted."""
 
 
+AnyPairs = SceneContacts | SceneIntersections | SceneProximities
+"""Pairs of an interval, or of a time."""
+
+
 @dataclass(frozen=True)
 class Contact:
     """A collision of two meshes, or of a mesh with itself, in words.
@@ -230,6 +234,14 @@ class IntervalResult:
     intersections: tuple[SceneIntersections, SceneIntersections] | None
     proximities: tuple[SceneProximities, SceneProximities] | None
     work: Work | None
+
+    def pairs(self, *, is_last: bool) -> list[AnyPairs]:
+        """Returns all pairs in the order of files: contacts, then those at rest.
+
+        Those at the end of an interval are those at the start of the next: only the last interval has both.
+        """
+        times = 2 if is_last and self.summary.end > self.summary.start else 1
+        return [self.contacts, *(self.intersections or ())[:times], *(self.proximities or ())[:times]]
 
 
 def summarize(
