@@ -149,7 +149,7 @@ def time_queries(kind, points, distance, timed, repeat):
     options = {"method": "conservative", "timed": timed, "timer": PhaseTimer(None)}
     with cores(1):
         while len(times) < repeat:
-            counts.assign(PairCounts(queued=len(rows)).values())
+            counts.assign(PairCounts(queued=len(rows)))
             start = time.perf_counter()
             run_distances([(phase, elements)], *inputs, **options)
             wp.synchronize()

@@ -3,11 +3,13 @@
 import contextlib
 import datetime
 import importlib.metadata
+import io
 import os
 import platform
 import shlex
 import subprocess
-from collections.abc import Iterable, Sequence
+import warnings
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -44,6 +46,14 @@ class Run:
 
     measured: Any = None
     problem: str | None = None
+
+
+@contextlib.contextmanager
+def silenced() -> Iterator[None]:
+    """Omits prints, which would be part of a JSON output (Style3D has some), and warnings: large strain is measured."""
+    with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+        warnings.simplefilter("ignore", UserWarning)
+        yield
 
 
 def describe_run(command: Sequence[str], devices: Iterable[wp.Device] = ()) -> dict[str, Any]:

@@ -181,12 +181,13 @@ class CollisionMesh:
         self.device_vertices = wp.array(self.vertices, dtype=int, device=self.device)
         self.device_faces = wp.array(self.faces, dtype=int, device=self.device)
         self.device_edges = wp.array(self.edges, dtype=int, device=self.device)
-        self.radius = None if radius is None else self._checked_radius(radius)
+        radii = checked_distances(0.0 if radius is None else radius, "radius", self.vertex_count)
+        self.radius = np.broadcast_to(radii, self.vertex_count).copy() if radii.any() else None
         self.world = None if world is None else self._checked_world(world)
         self.group = self.mask = None
         if group is not None or mask is not None:
-            self.group = self._checked_bits(1 if group is None else group, "group")
-            self.mask = self._checked_bits(-1 if mask is None else mask, "mask")
+            self.group = checked_bits(1 if group is None else group, "group", self.vertex_count)
+            self.mask = checked_bits(-1 if mask is None else mask, "mask", self.vertex_count)
 
     @functools.cached_property
     def pair_filter(self) -> PairFilter:
@@ -337,15 +338,6 @@ class CollisionMesh:
                 + (f" (so do {len(bad) - 1} other {name}s)" if len(bad) > 2 else "")
             )
         return np.ascontiguousarray(elements, dtype=np.int32)
-
-    def _checked_radius(self, radius: ArrayLike | wp.array) -> np.ndarray | None:
-        """Returns the radius of each vertex, float64, shape [vertex_count], or None if all are 0."""
-        values = checked_distances(radius, "radius", self.vertex_count)
-        return np.broadcast_to(values, self.vertex_count).copy() if values.any() else None
-
-    def _checked_bits(self, bits: ArrayLike | wp.array, name: str) -> np.ndarray:
-        """Returns groups or masks of the vertices, uint32, shape [vertex_count]."""
-        return checked_bits(bits, name, self.vertex_count)
 
     def _checked_world(self, world: ArrayLike | wp.array) -> np.ndarray:
         """Returns the world of each vertex, int32, shape [vertex_count], one for the vertices of a face or an edge."""

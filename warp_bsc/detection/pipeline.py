@@ -331,11 +331,7 @@ class DetectionPipeline:
     ) -> None:
         """Enqueues the candidates in the queues of the narrow phases, which do not run.
 
-        Args:
-            x0: Positions at the start, Warp array of vec3 or vec3d on the mesh's device.
-            x1: Positions at the end, of the same type.
-            changed: As of :meth:`.BroadPhaseHierarchy.pair_elements`.
-            keep_separated: The same.
+        Arguments are those of :meth:`find_contacts`.
         """
         self._pad_arcs()
         self.counters.array.zero_()
@@ -356,12 +352,7 @@ class DetectionPipeline:
         self.broad_phase.pair_edges_with_faces(x, self.edge_edge.counts, self.edge_edge.queue)
 
     def find_overlapping(self, x0: wp.array, x1: wp.array) -> None:
-        """Enqueues all pairs whose swept boxes overlap in the queues of the narrow phases, which do not run.
-
-        Args:
-            x0: Positions at the start, Warp array of vec3 or vec3d on the mesh's device.
-            x1: Positions at the end, of the same type.
-        """
+        """Enqueues all pairs whose swept boxes overlap, as :meth:`find_candidates` does those that it finds."""
         self._pad_arcs()
         self.counters.array.zero_()
         queues = _queues(self.vertex_face, self.edge_edge)

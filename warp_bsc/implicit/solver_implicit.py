@@ -355,18 +355,16 @@ class SolverImplicit(SolverCCD):
         begin(work)
         self.newton_method.solve(end, step.dt)
         detect_contacts(work)
-        wp.capture_if(work.loop[Loop.UNFINISHED], self._retreat, end=end)
+        wp.capture_if(work.loop[Loop.UNFINISHED], self.newton_method.retreat, end=end, detect=self._detect)
         resolve_contacts(work, step.dt)
-
-    def _retreat(self, end):
-        self.newton_method.retreat(end, self._detect)
 
     def _detect(self):
         begin(self.work)
         detect_contacts(self.work)
 
     def _measure_strain(self):
-        self._meter.measure_step(self._motion.vertices, self.report.last_strain)
+        motion = self._motion.vertices
+        self._meter.measure(motion, motion.x0, self.report.last_strain)
 
     def update_contacts(self, contacts, state=None):
         """Raises NotImplementedError: the contacts of the solve are no contacts of Newton's pipeline."""

@@ -1,6 +1,5 @@
 """The collision stage for Newton: a solver that wraps another one, and makes its motion free of collisions."""
 
-import functools
 from collections.abc import Collection, Mapping
 from typing import Literal, get_args
 
@@ -273,8 +272,10 @@ class SolverCCD(CollisionStage):
 
     def _measure_strain(self):
         """Measures the strain by contacts of a whole step, for the report."""
-        measure = functools.partial(self._meter.measure, self._motion.vertices, self.report.last_strain)
-        wp.capture_if(self.work.loop[Loop.UNFINISHED], measure)
+        motion, strain = self._motion.vertices, self.report.last_strain
+        wp.capture_if(
+            self.work.loop[Loop.UNFINISHED], self._meter.measure, motion=motion, before=motion.x1, strain=strain
+        )
 
     def _write_end(self, step, end):
         """Writes the resolved motion to the arrays of a state, and publishes the contacts."""

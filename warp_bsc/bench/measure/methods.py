@@ -277,7 +277,7 @@ class MethodRun:
         given = queries.given
         first_elements = len(given.x0) if queries.kind == PairKind.VERTEX_FACE else len(given.elements)
         self._counts = wp.zeros(len(Count), dtype=wp.int64, device=device)
-        self._start_counts = wp.array(PairCounts(queued=n).values(), dtype=wp.int64, device=device)
+        self._start_counts = wp.array(PairCounts(queued=n), dtype=wp.int64, device=device)
         self._narrow_phase = NarrowPhase(queries.kind, self._counts, n, (first_elements, len(given.elements)))
         wp.copy(self._narrow_phase.queue, given.pairs)
         retry_until_fits(self.launch, self._narrow_phase, device)

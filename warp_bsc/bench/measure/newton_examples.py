@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from ..._arguments import checked_choice
 from ..record import Run
 from ..scenes.newton_examples import NewtonExample, describe_needs
 from ..tables import Column, Table
@@ -145,8 +146,7 @@ def measure_example(
     Raises:
         ValueError: If the mode or a number is out of range.
     """
-    if mode not in MODES:
-        raise ValueError(f"mode must be one of {', '.join(MODES)}, not {mode!r}")
+    checked_choice(mode, "mode", MODES)
     if frames is not None and frames <= WARM_UP:
         raise ValueError(f"frames must be more than {WARM_UP}, as the times of these are left out, not {frames}")
     if check_every < 1:

@@ -3,10 +3,7 @@
 The scenes are in :mod:`..scenes.penetration`, which is imported with Newton when the first one is run.
 """
 
-import contextlib
-import io
 import math
-import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -14,7 +11,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..record import Run, version_of
+from ..._arguments import checked_choice
+from ..record import Run, silenced, version_of
 from ..tables import Column, Table, count, grouped
 
 SCENES = {
@@ -204,9 +202,8 @@ def measure_penetration(
     Raises:
         ValueError: If a name is unknown or ``frames`` less than 1.
     """
-    for name, value, known in (("scene", scene, SCENES), ("simulator", simulator, SIMULATORS)):
-        if value not in known:
-            raise ValueError(f"{name} must be one of {', '.join(known)}, not {value!r}")
+    checked_choice(scene, "scene", tuple(SCENES))
+    checked_choice(simulator, "simulator", tuple(SIMULATORS))
     if frames is not None and frames < 1:
         raise ValueError(f"frames must be at least 1, not {frames}")
     from ..peers.states import NotInstalled  # noqa: PLC0415 (imports Newton)
@@ -214,9 +211,7 @@ def measure_penetration(
     from ..scenes.simulation import NotFinite  # noqa: PLC0415 (imports Newton)
 
     try:
-        with wp.ScopedDevice(device), warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
-            # what Style3D prints would be part of a JSON output; large strain is measured, and needs no warning
-            warnings.simplefilter("ignore", UserWarning)
+        with wp.ScopedDevice(device), silenced():
             measured = _measure(scene, simulator, frames, progress or (lambda done, steps: None))
     except (NotInstalled, NotRunnable, NotFinite) as reason:
         return PenetrationRun(scene, simulator, problem=str(reason))

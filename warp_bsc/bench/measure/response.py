@@ -3,10 +3,6 @@
 The scenes are in :mod:`..scenes.contact`, which is imported with Newton when the first one is measured.
 """
 
-import contextlib
-import io
-import math
-import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
@@ -14,7 +10,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..record import Run
+from ..._arguments import checked_choice, checked_number
+from ..record import Run, silenced
 from ..tables import Column, Table, count, grouped, in_thousands
 
 SCENES = (
@@ -190,20 +187,15 @@ def measure_response(
     Raises:
         ValueError: If a name is unknown or a number out of range.
     """
-    for name, value, known in (
-        ("scene", scene, SCENES),
-        ("configuration", configuration, CONFIGURATIONS),
-        ("solver", solver, SOLVERS),
-    ):
-        if value not in known:
-            raise ValueError(f"{name} must be one of {', '.join(known)}, not {value!r}")
-    if seconds is not None and not 0.0 < seconds < math.inf:
-        raise ValueError(f"seconds must be finite and more than 0, not {seconds}")
+    checked_choice(scene, "scene", SCENES)
+    checked_choice(configuration, "configuration", CONFIGURATIONS)
+    checked_choice(solver, "solver", SOLVERS)
+    for name, number in (("seconds", seconds), ("perturb", perturb)):
+        if number is not None:
+            checked_number(number, name, 0.0, above=True)
     for name, number in (("rate", rate), ("reference_rate", reference_rate)):
         if number is not None and number < 1:
             raise ValueError(f"{name} must be at least 1, not {number}")
-    if perturb is not None and not 0.0 < perturb < math.inf:
-        raise ValueError(f"perturb must be finite and more than 0, not {perturb}")
     from ..scenes.contact import NotRunnable  # noqa: PLC0415 (imports Newton)
     from ..scenes.simulation import NotFinite  # noqa: PLC0415 (imports Newton)
 
@@ -221,9 +213,7 @@ def measure_response(
         return _measure(scene, configuration, solver, seconds, rate, reference_rate, offset, show)
 
     try:
-        with wp.ScopedDevice(device), warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
-            # what Style3D prints would be part of a JSON output; large strain is measured, and needs no warning
-            warnings.simplefilter("ignore", UserWarning)
+        with wp.ScopedDevice(device), silenced():
             measured, early = run(0, 0.0)
             if perturb is not None and passes == 2:
                 moved, _ = run(1, perturb)

@@ -3,6 +3,7 @@
 Lengths are in metres, z points up. No scene begins with a crossing.
 """
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -332,11 +333,6 @@ def _build_press(builder: SceneBuilder, *, height: float = 0.6, walls: bool = Fa
     return Scene(builder.finish(), 2.0, motion=Motion(poses))
 
 
-def _build_press_tight(builder: SceneBuilder) -> Scene:
-    """A plate presses a soft block in a box to 0.75 of its height, without room at its sides."""
-    return _build_press(builder, height=0.75, walls=True)
-
-
 def _build_ropes(builder: SceneBuilder) -> Scene:
     """Six ropes of springs fall across a cloth that is held at its border."""
     builder.add_cloth((0.0, 0.0, 0.0), (12, 12), 0.04, radius=0.004, is_held=True)
@@ -412,7 +408,7 @@ SCENES: dict[str, Callable[[SceneBuilder], Scene]] = {
     "soft_bowl": _build_soft_bowl,
     "pile": _build_pile,
     "press": _build_press,
-    "press_tight": _build_press_tight,
+    "press_tight": functools.partial(_build_press, height=0.75, walls=True),
     "ropes": _build_ropes,
     "ball": _build_ball,
     "ball_two_way": _build_ball_two_way,

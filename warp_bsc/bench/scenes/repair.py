@@ -143,13 +143,18 @@ def _stack_scene(rng: np.random.Generator):
     return faces, x, np.zeros(len(x), bool), sheet
 
 
+def _fold(u: np.ndarray, r: float) -> tuple[np.ndarray, np.ndarray]:
+    """Returns x and z along a sheet whose second half lies over the first, around a bend of radius r."""
+    turn = np.clip((u - 0.5) / r, 0, np.pi)
+    x = np.where(u < 0.5, u, 0.5 + r * np.sin(turn) - np.maximum(0, u - 0.5 - np.pi * r))
+    return x, np.where(u < 0.5, 0.0, r * (1 - np.cos(turn)))
+
+
 def _fold_scene(rng: np.random.Generator):
     r = rng.uniform(0.02, 0.03)
 
     def place(u, v):
-        turn = np.clip((u - 0.5) / r, 0, np.pi)
-        x = np.where(u < 0.5, u, 0.5 + r * np.sin(turn) - np.maximum(0, u - 0.5 - np.pi * r))
-        z = np.where(u < 0.5, 0.0, r * (1 - np.cos(turn)))
+        x, z = _fold(u, r)
         return np.stack([x, v + 0.01 * u, z + 0.01 * np.sin(6 * v)], -1)
 
     x, faces = _grid(60, 50, place)
@@ -237,12 +242,9 @@ def _of_sheets(lower: _Surface, upper: _Surface, lift: np.ndarray) -> TangledMes
 
 def _folded() -> TangledMesh:
     rng = np.random.default_rng(0)
-    r = 0.03
 
     def place(u, v, depth):
-        turn = np.clip((u - 0.5) / r, 0, np.pi)
-        x = np.where(u < 0.5, u, 0.5 + r * np.sin(turn) - np.maximum(0, u - 0.5 - np.pi * r))
-        z = np.where(u < 0.5, 0.0, r * (1 - np.cos(turn)))
+        x, z = _fold(u, 0.03)
         sunk = depth * np.exp(-((x - 0.25) ** 2 + (v - 0.5) ** 2) / 0.01) * (u > 0.6)
         return np.stack([x, v, z - sunk], -1)
 

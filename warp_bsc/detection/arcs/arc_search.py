@@ -142,7 +142,7 @@ class ArcSearch:
             lambda: pipeline.find_contacts(start, end, changed=changed, timer=timer), pipeline, self._mesh.device
         )
         # what floating point has left to exact arithmetic stays as it is
-        pairs = {kind.label: dataclasses.replace(counts, for_exact=0) for kind, counts in pipeline.counts.pairs.items()}
+        pairs = {kind.label: counts._replace(for_exact=0) for kind, counts in pipeline.counts.pairs.items()}
         counts = dataclasses.replace(pipeline.counts, **pairs)
         self._counts = counts if self._counts is None else add_counts(self._counts, counts)
         with timer.phase("sort"):

@@ -335,7 +335,7 @@ def distances(points: ArrayLike | wp.array, kind: str, *, device: wp.DeviceLike 
     x, elements, pairs = mesh_of_rows(of_kind, points, device)
     queue = _ProximityQueue(of_kind, wp.zeros(len(Count), dtype=wp.int64, device=device), len(points), device)
     queue.candidates.assign(pairs)
-    queue.counts.assign(PairCounts(queued=len(points)).values())
+    queue.counts.assign(PairCounts(queued=len(points)))
     queue.launch(x, elements, Rings(), np.inf)
     queue.grow(len(points), len(points))
     return queue.read()[1]

@@ -141,14 +141,7 @@ class BroadPhaseHierarchy:
         self._launch_over_pairs(pair_edges_with_faces_kernel, counts, pairs)
 
     def fit(self, x0: wp.array, x1: wp.array, changed: wp.array | None = None, *, keep_separated: bool = False) -> None:
-        """Writes the corners and the boxes of all faces of a motion, and boxes all nodes.
-
-        Args:
-            x0: Positions at the start, array of vec3 or vec3d.
-            x1: Positions at the end, of the same type.
-            changed: Nonzero for each vertex whose pairs are sought, array of int; None for all.
-            keep_separated: Whether to seek the pairs that an axis separates at both ends, too.
-        """
+        """Writes the corners and the boxes of all faces, and boxes all nodes; arguments as of :meth:`pair_elements`."""
         self._swept = keep_separated
         inputs = [x0, x1, changed, self._checked, self._padding, keep_separated, self.hierarchy]
         outputs = [self._not_finite]

@@ -24,13 +24,7 @@ class BroadPhaseSimd:
     capacity: int = UNLIMITED
 
     def __init__(self, mesh: CollisionMesh, count: wp.array, *, padding: wp.array | None = None):
-        """Allocates trees over the vertices, the edges and the faces of a mesh.
-
-        Args:
-            mesh: The mesh.
-            count: Not used.
-            padding: How far the boxes of each vertex and its elements reach beyond them, array of float64, or None.
-        """
+        """Allocates trees over the elements of a mesh, with padding as of :class:`.BroadPhaseHierarchy`."""
         self.lock = threading.RLock()
         self._filtered_of_worlds: wp.array | None = None
         shared = mesh.world, padding, mesh.pair_filter

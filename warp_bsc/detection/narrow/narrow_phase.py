@@ -4,7 +4,6 @@ Every phase writes a compact queue for the next, so that no thread waits for a n
 the device; they tell if a queue was too small, see :mod:`warp_bsc.kernels.pipeline.queues`.
 """
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -74,7 +73,7 @@ class NarrowPhase:
         """Capacities for the counts."""
         unlimited = PairCounts(*[UNLIMITED] * len(Count))
         queue, survivors, contacts = len(self.queue), len(self._survivors), len(self.contacts.pairs)
-        return dataclasses.replace(unlimited, queued=queue, survivors=survivors, contacts=contacts)
+        return unlimited._replace(queued=queue, survivors=survivors, contacts=contacts)
 
     def grow(self, counts: PairCounts | None = None) -> bool:
         """Enlarges the buffers that are too small for the counts, with a quarter to spare.
@@ -88,7 +87,7 @@ class NarrowPhase:
         Raises:
             ValueError: If a buffer cannot be large enough.
         """
-        counts = PairCounts.of(self.counts.numpy()) if counts is None else counts
+        counts = PairCounts(*self.counts.numpy().tolist()) if counts is None else counts
         overflowed = bool(counts.overflows(self.capacities, self.kind))
         label = self.kind.label
         if counts.queued > len(self.queue):

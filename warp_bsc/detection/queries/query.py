@@ -277,7 +277,7 @@ def _query(
     counts = wp.zeros(len(Count), dtype=wp.int64, device=device)
     narrow_phase = NarrowPhase(kind, counts, n, pairs[-1] + 1 if n else (1, 1))
     narrow_phase.queue.assign(pairs)
-    all_queued = PairCounts(queued=n).values()
+    all_queued = PairCounts(queued=n)
     # without a distance: the narrow phase of contacts
     contact = kind in (DistanceKind.VERTEX_FACE, DistanceKind.EDGE_EDGE) and not distance.any()
     radius = np.zeros((n, half))

@@ -165,7 +165,7 @@ class DeviceQueryResult:
             rows.normal = self.normal = wp.empty(n, dtype=wp.vec3d, device=self.device)
         self.not_finite, self.undecided = (wp.zeros(1, dtype=wp.int64, device=self.device) for _ in range(2))
         self._counts = wp.zeros(len(Count), dtype=wp.int64, device=self.device)
-        self._start_counts = wp.array(PairCounts(queued=n).values(), dtype=wp.int64, device=self.device)
+        self._start_counts = wp.array(PairCounts(queued=n), dtype=wp.int64, device=self.device)
         self._narrow_phases: dict[PairKind, tuple[NarrowPhase, wp.array]] = {}
         self._loaded: set[tuple[PairKind, type, Method]] = set()
 

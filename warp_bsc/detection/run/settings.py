@@ -1,10 +1,11 @@
 """Settings and counters that all parts of the detection share: kinds of pairs, methods, tolerances, kernel options."""
 
 import enum
-from dataclasses import dataclass, fields, replace
-from typing import Literal, get_args
+import itertools
+from dataclasses import dataclass, replace
+from operator import add
+from typing import Literal, NamedTuple, get_args
 
-import numpy as np
 import warp as wp
 
 from ..._arguments import checked_number
@@ -125,9 +126,8 @@ class Count(enum.IntEnum):
     FILTERED = 12
 
 
-@dataclass(frozen=True)
-class PairCounts:
-    """Counts of one kind of pair, or capacities for them, on the host; the attributes are those of :class:`Count`."""
+class PairCounts(NamedTuple):
+    """Counts of one kind of pair, or capacities for them, on the host, in the order of :class:`Count`."""
 
     queued: int = 0
     survivors: int = 0
@@ -143,15 +143,6 @@ class PairCounts:
     subdivided: int = 0
     filtered: int = 0
 
-    @classmethod
-    def of(cls, values: np.ndarray) -> "PairCounts":
-        """Returns the counts in an array of int64 by :class:`Count`."""
-        return cls(*map(int, values))
-
-    def values(self) -> list[int]:
-        """Returns the counts in the order of :class:`Count`."""
-        return [getattr(self, field.name) for field in fields(self)]
-
     @property
     def collisions(self) -> int:
         """Number of pairs that are reported."""
@@ -161,9 +152,12 @@ class PairCounts:
         """Names each buffer of a kind that is too small for these counts, with count and capacity."""
         return [
             f"{kind.label} {count.name.lower()}: {needed} do not fit in the capacity {capacity}"
-            for count, needed, capacity in zip(Count, self.values(), capacities.values(), strict=True)
+            for count, needed, capacity in zip(Count, self, capacities, strict=True)
             if needed > capacity
         ]
+
+
+_NO_PAIRS = PairCounts()
 
 
 class Counter(enum.IntEnum):
@@ -195,8 +189,8 @@ class Counts:
     face_pairs: int
     vertex_face: PairCounts
     edge_edge: PairCounts
-    vertex_edge: PairCounts = PairCounts()
-    vertex_vertex: PairCounts = PairCounts()
+    vertex_edge: PairCounts = _NO_PAIRS
+    vertex_vertex: PairCounts = _NO_PAIRS
 
     @property
     def pairs(self) -> dict[DistanceKind, PairCounts]:
@@ -205,11 +199,11 @@ class Counts:
 
     def without_filtered(self) -> "Counts":
         """Returns the counts with no pair that is filtered."""
-        return replace(self, **{kind.label: replace(counts, filtered=0) for kind, counts in self.pairs.items()})
+        return replace(self, **{kind.label: counts._replace(filtered=0) for kind, counts in self.pairs.items()})
 
     def values(self) -> list[int]:
         """Returns all counts in the order of :class:`Counters`."""
-        return [self.not_finite, self.face_pairs, *(v for counts in self.pairs.values() for v in counts.values())]
+        return [self.not_finite, self.face_pairs, *itertools.chain(*self.pairs.values())]
 
     def overflows(self, capacities: "Counts") -> list[str]:
         """Names each buffer that is too small for these counts, with count and capacity."""
@@ -222,11 +216,7 @@ class Counts:
 
 def add_counts(first: Counts, second: Counts) -> Counts:
     """Returns the counts of two detections together."""
-
-    def add_pairs(one: PairCounts, other: PairCounts) -> PairCounts:
-        return PairCounts(*(a + b for a, b in zip(one.values(), other.values(), strict=True)))
-
-    pairs = {kind.label: add_pairs(counts, second.pairs[kind]) for kind, counts in first.pairs.items()}
+    pairs = {kind.label: PairCounts(*map(add, counts, second.pairs[kind])) for kind, counts in first.pairs.items()}
     return Counts(first.not_finite + second.not_finite, first.face_pairs + second.face_pairs, **pairs)
 
 

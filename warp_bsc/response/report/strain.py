@@ -49,20 +49,11 @@ class StrainMeter:
         columns = zip(edges_at_rest(work.mesh.model), (wp.vec2i, float, bool), strict=True)
         self._edges = [wp.array(values, dtype=dtype, device=work.device) for values, dtype in columns]
 
-    def measure(self, motion: Motion, strain: wp.array[float]) -> None:
-        """Increases ``strain`` to that between predicted positions and positions as they are, of each world.
+    def measure(self, motion: Motion, before: wp.array[wp.vec3], strain: wp.array[float]) -> None:
+        """Increases ``strain``, shape [worlds], to that from positions ``before`` to positions as they are.
 
-        Args:
-            motion: The motion, as the inner solver predicted it.
-            strain: Shape [worlds].
+        The positions are those that the inner solver predicted, or those at the start of the motion.
         """
-        self._measure(motion, motion.x1, strain)
-
-    def measure_step(self, motion: Motion, strain: wp.array[float]) -> None:
-        """Increases ``strain`` to that from the start of a motion to positions as they are, of each world."""
-        self._measure(motion, motion.x0, strain)
-
-    def _measure(self, motion, before, strain):
         inputs = [motion, before, self._work.vertices.x1, *self._edges]
         self._work.launch(measure_strain, len(self._edges[0]), inputs, [strain])
 
