@@ -277,13 +277,7 @@ def benchmark_queries(
 def benchmark_copy(*, device: wp.DeviceLike = None, repeat: int = 20) -> float:
     """Measures the rate at which a device copies a large array: bytes read plus bytes written [1/s].
 
-    Args:
-        device: Warp device; default: Warp's default.
-        repeat: Number of repetitions; their median counts.
-
-    Raises:
-        TypeError: If ``repeat`` is no integer.
-        ValueError: If ``repeat`` is less than 1.
+    Arguments and errors are those of :func:`benchmark_queries`.
     """
     repeat = checked_integer(repeat, "repeat", 1)
     device = wp.get_device(device)

@@ -48,13 +48,7 @@ def has_intersections(faces: np.ndarray, x: np.ndarray) -> bool:
 
 
 def decide_queries(method: str, kind: PairKind, points: np.ndarray) -> np.ndarray:
-    """Returns whether each query collides by a method of the IPC Toolkit, bool, shape [n].
-
-    Args:
-        method: One of :data:`CCD_CLASSES`.
-        kind: Kind of pair.
-        points: Queries, rows as of :func:`warp_bsc.query_vertex_face`, shape [n, 8, 3].
-    """
+    """Returns whether each query, as of :func:`time_queries`, collides by a method, bool, shape [n]."""
     ccd = _ccd(method, kind)
     return np.array([ccd(*query)[0] for query in np.asarray(points, dtype=np.float64)], dtype=bool)
 

@@ -42,12 +42,7 @@ class LibuipcScene:
     """
 
     def __init__(self, built: PenetrationScene, rate: int):
-        """Makes it.
-
-        Args:
-            built: The scene, as it is built for VBD.
-            rate: Steps a second.
-        """
+        """Makes it of a scene, as it is built for VBD, for a rate of steps a second."""
         self._model, self._motion, self._rate = built.scene.model, built.scene.motion, rate
         model = self._model
         self._start = host_array(model.particle_q).astype(np.float64)

@@ -37,13 +37,7 @@ _INERTIA = 'diaginertia="1e-6 1e-6 1e-6"'  # of bodies that do not turn
 def simulate_mujoco(
     built: PenetrationScene, rate: int, seconds: float, progress: Callable[[int, int], None]
 ) -> Trajectory:
-    """Runs a scene, as it is built for VBD, on the CPU.
-
-    Args:
-        built: The scene.
-        rate: Steps a second.
-        seconds: Simulated time [s].
-        progress: Called with the number of steps done and the number of all.
+    """Runs a scene, as it is built for VBD, on the CPU, with arguments as of :func:`.libuipc.simulate_libuipc`.
 
     Raises:
         NotInstalled: If MuJoCo is not installed, or too old.

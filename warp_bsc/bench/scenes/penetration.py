@@ -120,14 +120,5 @@ SCENES: dict[str, Callable[[SceneBuilder], PenetrationScene]] = {
 
 
 def build_penetration_scene(name: str, solver: str, rate: int) -> PenetrationScene:
-    """Builds a scene for a solver of Newton on Warp's current device.
-
-    Args:
-        name: A key of :data:`SCENES`.
-        solver: One of :data:`..measure.response.SOLVERS`, or ``"implicit"``.
-        rate: Steps a second.
-
-    Raises:
-        NotRunnable: If the solver cannot run the scene; the message says why.
-    """
+    """Builds a scene of :data:`SCENES`, with other arguments and errors as of :func:`.contact.build_scene`."""
     return SCENES[name](SceneBuilder(solver, rate))

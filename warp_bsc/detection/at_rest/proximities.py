@@ -172,17 +172,7 @@ class ProximityFinder:
     """
 
     def __init__(self, mesh: CollisionMesh, distance: float, *, rings: int = 1):
-        """Allocates the buffers on the mesh's device.
-
-        Args:
-            mesh: The mesh.
-            distance: Distance up to which pairs are near, in the unit of the positions, more than 0, taken as exact.
-            rings: Pairs are excluded if a vertex of one is within this number of edges of a vertex of the other.
-
-        Raises:
-            TypeError: If an argument has another type.
-            ValueError: If the distance is not finite or less than 2^-1021, or the rings are out of range.
-        """
+        """Allocates the buffers on the mesh's device; arguments as of :meth:`.CollisionDetector.find_proximities`."""
         check_instance(mesh, "mesh", CollisionMesh, "a CollisionMesh")
         self._mesh = mesh
         self._distance = checked_distance(distance, "distance", zero=False)
