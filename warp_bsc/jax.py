@@ -41,21 +41,8 @@ def rollout(
     and second derivatives raise an error. The backward pass clears the gradients of arrays of the model. The last 16
     kinds of rollouts are kept, with their solvers.
 
-    Args:
-        solver: As for :func:`warp_bsc.torch.rollout`, like ``dt``, ``steps`` and ``states``.
-        state: Arrays by name, as its tensors.
-        controls: Arrays by name, as its tensors.
-        dt: Length of a step [s].
-        steps: Steps, a multiple of the rows of controls; default: one a row.
-        states: Whether the result is the ``"last"`` state or ``"all"``, each array then with a row a step.
-        every: As of :func:`warp_bsc.torch.rollout`; the backward pass takes the steps twice then.
-
-    Returns:
-        The arrays of the last state by name, those that the model has; or of all states, shape [steps, ...].
-
-    Raises:
-        TypeError: If an argument has another type, or an array is not of float32.
-        ValueError: If a number is out of range, a name is unknown, or a shape is not that of the model.
+    Arguments, result and errors are those of :func:`warp_bsc.torch.rollout`, with arrays in place of tensors, on any
+    device. With ``every``, the backward pass takes the steps twice.
     """
     check_instance(solver, "solver", SolverBase, "a solver of Newton")
     given = dict(state), dict(controls or {})

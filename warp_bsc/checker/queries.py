@@ -46,49 +46,25 @@ def vertex_face(points: ArrayLike, min_distance: ArrayLike = 0.0) -> np.ndarray:
 
 
 def edge_edge(points: ArrayLike, min_distance: ArrayLike = 0.0) -> np.ndarray:
-    """Returns which edge-edge queries collide.
+    """Returns which edge-edge queries collide, with arguments, result and errors as of :func:`vertex_face`.
 
-    Args:
-        points: Positions, float32 or float64 array of shape (n, 8, 3), rows a0 b0 c0 d0 a1 b1 c1 d1; edges ab and cd.
-        min_distance: As in :func:`vertex_face`.
-
-    Returns:
-        Bool array of shape (n,).
-
-    Raises:
-        ValueError: As in :func:`vertex_face`.
+    The points have shape (n, 8, 3), rows a0 b0 c0 d0 a1 b1 c1 d1; edges ab and cd.
     """
     return _decide(collides, "edge_edge", points, min_distance)
 
 
 def vertex_edge(points: ArrayLike, min_distance: ArrayLike = 0.0) -> np.ndarray:
-    """Returns which vertex-edge queries collide.
+    """Returns which vertex-edge queries collide, with arguments, result and errors as of :func:`vertex_face`.
 
-    Args:
-        points: Positions, float32 or float64 array of shape (n, 6, 3), rows p0 a0 b0 p1 a1 b1; vertex p and edge ab.
-        min_distance: As in :func:`vertex_face`.
-
-    Returns:
-        Bool array of shape (n,).
-
-    Raises:
-        ValueError: As in :func:`vertex_face`.
+    The points have shape (n, 6, 3), rows p0 a0 b0 p1 a1 b1; vertex p and edge ab.
     """
     return _decide(collides, "vertex_edge", points, min_distance)
 
 
 def vertex_vertex(points: ArrayLike, min_distance: ArrayLike = 0.0) -> np.ndarray:
-    """Returns which vertex-vertex queries collide.
+    """Returns which vertex-vertex queries collide, with arguments, result and errors as of :func:`vertex_face`.
 
-    Args:
-        points: Positions, float32 or float64 array of shape (n, 4, 3), rows p0 q0 p1 q1; vertices p and q.
-        min_distance: As in :func:`vertex_face`.
-
-    Returns:
-        Bool array of shape (n,).
-
-    Raises:
-        ValueError: As in :func:`vertex_face`.
+    The points have shape (n, 4, 3), rows p0 q0 p1 q1; vertices p and q.
     """
     return _decide(collides, "vertex_vertex", points, min_distance)
 
@@ -96,64 +72,35 @@ def vertex_vertex(points: ArrayLike, min_distance: ArrayLike = 0.0) -> np.ndarra
 def vertex_face_toi(points: ArrayLike, min_distance: ArrayLike = 0.0) -> np.ndarray:
     """Returns bounds of the earliest contact time of vertex-face queries.
 
-    Args:
-        points: As in :func:`vertex_face`.
-        min_distance: As in :func:`vertex_face`.
+    Arguments and errors are those of :func:`vertex_face`.
 
     Returns:
         Float64 array of shape (n, 2): the largest double that is not after the earliest contact, and the smallest one
         that is not before it. They are equal when that time is a double, neighbours otherwise, NaN for no collision.
-
-    Raises:
-        ValueError: As in :func:`vertex_face`.
     """
     return _decide(earliest, "vertex_face", points, min_distance)
 
 
 def edge_edge_toi(points: ArrayLike, min_distance: ArrayLike = 0.0) -> np.ndarray:
-    """Returns bounds of the earliest contact time of edge-edge queries.
+    """Returns bounds of the earliest contact time of edge-edge queries, as of :func:`vertex_face_toi`.
 
-    Args:
-        points: As in :func:`edge_edge`.
-        min_distance: As in :func:`vertex_face`.
-
-    Returns:
-        Float64 array of shape (n, 2), as in :func:`vertex_face_toi`.
-
-    Raises:
-        ValueError: As in :func:`vertex_face`.
+    Arguments are those of :func:`edge_edge`.
     """
     return _decide(earliest, "edge_edge", points, min_distance)
 
 
 def vertex_edge_toi(points: ArrayLike, min_distance: ArrayLike = 0.0) -> np.ndarray:
-    """Returns bounds of the earliest contact time of vertex-edge queries.
+    """Returns bounds of the earliest contact time of vertex-edge queries, as of :func:`vertex_face_toi`.
 
-    Args:
-        points: As in :func:`vertex_edge`.
-        min_distance: As in :func:`vertex_face`.
-
-    Returns:
-        Float64 array of shape (n, 2), as in :func:`vertex_face_toi`.
-
-    Raises:
-        ValueError: As in :func:`vertex_face`.
+    Arguments are those of :func:`vertex_edge`.
     """
     return _decide(earliest, "vertex_edge", points, min_distance)
 
 
 def vertex_vertex_toi(points: ArrayLike, min_distance: ArrayLike = 0.0) -> np.ndarray:
-    """Returns bounds of the earliest contact time of vertex-vertex queries.
+    """Returns bounds of the earliest contact time of vertex-vertex queries, as of :func:`vertex_face_toi`.
 
-    Args:
-        points: As in :func:`vertex_vertex`.
-        min_distance: As in :func:`vertex_face`.
-
-    Returns:
-        Float64 array of shape (n, 2), as in :func:`vertex_face_toi`.
-
-    Raises:
-        ValueError: As in :func:`vertex_face`.
+    Arguments are those of :func:`vertex_vertex`.
     """
     return _decide(earliest, "vertex_vertex", points, min_distance)
 

@@ -146,20 +146,12 @@ class CollisionDetector:
         vertices bound the earliest time, pairs are sought up to there, and tested on motions that are shortened until
         one is free. On a GPU, where all are soon detected, its several detections take more. Positions at its end are
         certified as they are rounded: go on from ``FreeStep.x``. The step ends before the earliest time of impact by
-        about the tolerance of the detector, or by more where rounded positions collide.
-
-        Args:
-            x0: Positions at the start, as of :meth:`detect`.
-            x1: Positions at the end, of the same type.
+        about the tolerance of the detector, or by more where rounded positions collide. Positions and errors are those
+        of :meth:`detect`.
 
         Returns:
             FreeStep: The whole motion if it is free, with ``x1``; ``x0``, not certified, if elements touch or are
             within the minimum distance there, or if "conservative" cannot tell.
-
-        Raises:
-            TypeError: As :meth:`detect`.
-            ValueError: As :meth:`detect`.
-            RuntimeError: As :meth:`detect`.
         """
         self._check_not_capturing("find the step")
         start, end = (wp.clone(x, requires_grad=False) for x in self._checked_positions(x0, x1))
@@ -185,15 +177,7 @@ class CollisionDetector:
 
         Pairs share no vertex, and no coordinate axis separates them at the start and at the end, on the same side.
         Those that groups and masks leave out are not among them, but those within the rings of a minimum distance are.
-
-        Args:
-            x0: Positions at the start, as of :meth:`detect`; also those at the end for one configuration.
-            x1: Positions at the end, of the same type.
-
-        Raises:
-            TypeError: As :meth:`detect`.
-            ValueError: As :meth:`detect`.
-            RuntimeError: As :meth:`detect`.
+        Positions and errors are those of :meth:`detect`; for one configuration give its positions twice.
         """
         self._check_not_capturing("find candidates")
         x0, x1 = self._checked_positions(x0, x1)
@@ -268,14 +252,9 @@ class CollisionDetector:
         return find_intersections(self.mesh, x)
 
     def has_intersections(self, x: ArrayLike | wp.array) -> bool:
-        """Returns whether an edge meets a face in one configuration, exactly, as of :meth:`find_intersections`.
+        """Returns whether an edge meets a face in one configuration, exactly.
 
-        Args:
-            x: Positions, as of :meth:`find_intersections`.
-
-        Raises:
-            TypeError: As :meth:`find_intersections`.
-            ValueError: As :meth:`find_intersections`.
+        Positions and errors are those of :meth:`find_intersections`.
         """
         return len(self.find_intersections(x)) > 0
 
@@ -301,16 +280,7 @@ class CollisionDetector:
     def find_inversions(self, x: ArrayLike | wp.array) -> np.ndarray:
         """Returns the tetrahedra of the mesh whose volume is 0 or negative in one configuration, exactly.
 
-        Args:
-            x: Positions, as of :meth:`inversions`.
-
-        Returns:
-            Rows in ``mesh.tets``, sorted, int32, shape [n].
-
-        Raises:
-            TypeError: As :meth:`inversions`.
-            ValueError: As :meth:`inversions`.
-            RuntimeError: As :meth:`inversions`.
+        They are rows in ``mesh.tets``, sorted, int32, shape [n]. Positions and errors are those of :meth:`inversions`.
         """
         self._check_not_capturing("find inversions")
         x = self.mesh.device_positions(x, "x")
@@ -338,19 +308,8 @@ class CollisionDetector:
     def least_distance(self, x: ArrayLike | wp.array, *, rings: int = 1) -> float:
         """Returns the least distance of two elements in one configuration, in the unit of the positions.
 
-        Pairs are those of :meth:`find_proximities`, whose distances have its accuracy. An edge that passes through a
-        face is no pair: ask :meth:`has_intersections` as well.
-
-        Args:
-            x: Positions, as of :meth:`find_proximities`.
-            rings: As of :meth:`find_proximities`.
-
-        Returns:
-            The distance, infinite without a pair.
-
-        Raises:
-            TypeError: As :meth:`find_proximities`.
-            ValueError: As :meth:`find_proximities`.
+        It is infinite without a pair. Pairs are those of :meth:`find_proximities`, whose arguments, accuracy and errors
+        it has. An edge that passes through a face is no pair: ask :meth:`has_intersections` as well.
         """
         return least_distance(self.mesh, x, rings)
 

@@ -139,25 +139,10 @@ def query_edge_edge(
     device: wp.DeviceLike = None,
     out: DeviceQueryResult | None = None,
 ) -> QueryResult | DeviceQueryResult:
-    """Returns which pairs of moving edges meet.
+    """Returns which pairs of moving edges meet, with arguments, result and errors as of :func:`query_vertex_face`.
 
-    Args:
-        points: Positions, float32 or float64, NumPy or Warp array of shape [n, 8, 3], rows a0 b0 c0 d0 a1 b1 c1 d1:
-            edges a b and c d at the start (0) and at the end (1) of the step. Any unit of length.
-        min_distance: As of :func:`query_vertex_face`.
-        method: What becomes of queries that floating point cannot certify, one of :data:`METHODS`.
-        toi: Whether to find times of impact, coordinates and normals as well.
-        tolerance: Of the times of impact, as a share of the step, in [2^-38, 1].
-        device: Warp device to compute on; default: the points' own, or Warp's default for NumPy.
-        out: Results that stay on the device, as of :func:`query_vertex_face`.
-
-    Returns:
-        QueryResult: One row a query; or ``out``.
-
-    Raises:
-        TypeError: As :func:`query_vertex_face`.
-        ValueError: As :func:`query_vertex_face`.
-        RuntimeError: As :func:`query_vertex_face`.
+    The points have shape [n, 8, 3], rows a0 b0 c0 d0 a1 b1 c1 d1: edges a b and c d at the start (0) and at the end (1)
+    of the step.
     """
     if out is not None:
         return _query_into(out, PairKind.EDGE_EDGE, points, min_distance, method, toi, tolerance, device)
@@ -175,21 +160,8 @@ def query_vertex_edge(
 ) -> QueryResult:
     """Returns which moving vertices come within a distance of their moving edges.
 
-    Args:
-        points: Positions, float32 or float64, NumPy or Warp array of shape [n, 6, 3], rows p0 a0 b0 p1 a1 b1: vertex p
-            and edge a b at the start (0) and at the end (1) of the step. Any unit of length.
-        min_distance: As of :func:`query_vertex_face`.
-        method: What becomes of queries that floating point cannot certify, one of :data:`METHODS`.
-        toi: Whether to find times of impact, coordinates and normals as well.
-        tolerance: Of the times of impact, as a share of the step, in [2^-38, 1].
-        device: Warp device to compute on; default: the points' own, or Warp's default for NumPy.
-
-    Returns:
-        QueryResult: One row a query.
-
-    Raises:
-        TypeError: As :func:`query_vertex_face`.
-        ValueError: As :func:`query_vertex_face`.
+    The points have shape [n, 6, 3], rows p0 a0 b0 p1 a1 b1: vertex p and edge a b at the start (0) and at the end (1)
+    of the step. Other arguments, result and errors are those of :func:`query_vertex_face`.
     """
     return _query(DistanceKind.VERTEX_EDGE, points, min_distance, method, toi, tolerance, device)
 
@@ -205,21 +177,8 @@ def query_vertex_vertex(
 ) -> QueryResult:
     """Returns which pairs of moving vertices come within a distance of each other.
 
-    Args:
-        points: Positions, float32 or float64, NumPy or Warp array of shape [n, 4, 3], rows p0 q0 p1 q1: vertices p and
-            q at the start (0) and at the end (1) of the step. Any unit of length.
-        min_distance: As of :func:`query_vertex_face`.
-        method: What becomes of queries that floating point cannot certify, one of :data:`METHODS`.
-        toi: Whether to find times of impact, coordinates and normals as well.
-        tolerance: Of the times of impact, as a share of the step, in [2^-38, 1].
-        device: Warp device to compute on; default: the points' own, or Warp's default for NumPy.
-
-    Returns:
-        QueryResult: One row a query.
-
-    Raises:
-        TypeError: As :func:`query_vertex_face`.
-        ValueError: As :func:`query_vertex_face`.
+    The points have shape [n, 4, 3], rows p0 q0 p1 q1: vertices p and q at the start (0) and at the end (1) of the step.
+    Other arguments, result and errors are those of :func:`query_vertex_face`.
     """
     return _query(DistanceKind.VERTEX_VERTEX, points, min_distance, method, toi, tolerance, device)
 
