@@ -30,7 +30,7 @@ from usd_stages import FALLING, add_mesh, floor_stage, moved, new_stage, save
 from warp_bsc._atomic_file import OutputFile
 from warp_bsc.cli import replay_run
 from warp_bsc.cli.main import main
-from warp_bsc.scene_replay import usd_overlay
+from warp_bsc.usd.write.layer import SceneLayer
 
 
 @pytest.fixture
@@ -210,14 +210,15 @@ def test_full_disk_has_room_for_all_files(tmp_path, size):
 def test_no_room_at_the_end_is_an_error(tmp_path, monkeypatch, capsys, suffix):
     stage = many_hits(tmp_path / "scene.usda", samples=9)
     path = tmp_path / f"overlay.{suffix}"
-    write, calls = usd_overlay.write_layer, []
+    writing, calls = SceneLayer.writing, []
 
+    @contextlib.contextmanager
     def without_room(*arguments):
         calls.append(arguments)
-        with largest_file(10_000) if len(calls) == 1 else contextlib.nullcontext():
-            write(*arguments)
+        with largest_file(10_000) if len(calls) == 1 else contextlib.nullcontext(), writing(*arguments) as layer:
+            yield layer
 
-    monkeypatch.setattr(usd_overlay, "write_layer", without_room)
+    monkeypatch.setattr(SceneLayer, "writing", without_room)
     command = ["replay", save(stage), "--device", "cpu", "--no-intersections", "--overlay", str(path)]
     assert main(command) == 2
     assert f"overlay.{suffix}: not all of it is written: [Errno 27] File too large" in capsys.readouterr().err

@@ -2,7 +2,6 @@
 
 import os
 import re
-import secrets
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +10,8 @@ import numpy as np
 from .._version import __version__
 from ..usd.scene import Scene
 from ..usd.segment import Segment
-from ..usd.write.layer import just_before, layer_metadata, unused_path
-from ..usd.write.layer_writer import LayerContent, LayerPrim, LayerScope, PrimKind, write_layer
+from ..usd.write.layer import SceneLayer, just_before, unused_path
+from ..usd.write.layer_writer import LayerPrim, LayerScope, PrimKind, define_prims
 from .limit import not_listed
 from .outputs import ReplayOutput
 from .results import IntervalResult
@@ -144,10 +143,7 @@ class Overlay(ReplayOutput):
             OSError: If the file cannot be written.
             ValueError: If its name has another suffix, or the scene has no file.
         """
-        suffix = Path(path).suffix
-        if suffix not in (".usda", ".usdc", ".usd"):
-            raise ValueError(f"{path}: the name of an overlay, a USD layer, must end in .usda, .usdc or .usd")
-        self._format = "usda" if suffix == ".usda" else "usdc"
+        self._layer = SceneLayer(path, scene, "an overlay, a USD layer,")
         self._scene, self._command = scene, command
         self._last: IntervalResult | None = None  # the last complete interval
         self._prims: dict[str, int] = {}  # number of each mesh with a pair, by its name
@@ -155,7 +151,6 @@ class Overlay(ReplayOutput):
         self._root_path = unused_path(scene, "/Collisions")
         low, high = _bounds(scene)
         self._size = float(np.linalg.norm(high - low)) or 1.0
-        self._metadata = layer_metadata(scene)
         super().__init__(path)
         self._spool = SampleSpool(self.file.folder, {name: types for name, (_, types) in _PARTS.items()})
 
@@ -181,11 +176,18 @@ class Overlay(ReplayOutput):
         last, self._last = self._last, None
         if last and last.summary.end == end > last.summary.start:
             self._spool.add_last(end, self._find_at_rest(last, 1))
-        content = self._content(summary, end)
-        temporary = Path(self.file.folder, f".warp-bsc-{secrets.token_hex(8)}.tmp")
-        write_layer(content, temporary, self._format)
-        self.file.adopt(temporary)
-        self.file.commit()
+        missing, keys, root = str(not_listed(summary, with_end=True) or ""), self._spool.keys(), self._root_path
+        texts = "Collisions found by warp-bsc replay.", SHOWN_BY, missing, summary.motion, summary.not_checked
+        custom = {"collisions": self._facts(summary)}
+        with self._layer.writing(self.file, " ".join(filter(None, texts)), custom) as (layer, add):
+            asset = {"name": f"Collisions in {Path(self._scene.path).name}", "version": f"warp-bsc {__version__}"}
+            scopes, prims = self._scopes({pair for pair, _ in keys}), [self._layer_prim(*key) for key in keys]
+            names = {"prims": list(self._prims)}
+            define_prims(layer, root, asset, names, scopes, prims, "warp_bsc", _hidden(keys))
+            for key, prim in zip(keys, prims, strict=True):
+                for attribute, value_type in prim.attributes.items():
+                    for time, value in self._spool.time_samples(key, attribute, end):
+                        add(f"{root}/{prim.name}.{attribute}", value_type, time, value)
 
     def shrink(self) -> bool:
         """Drops the samples of the last intervals."""
@@ -312,31 +314,6 @@ class Overlay(ReplayOutput):
         used, rows = np.unique(meshes, return_inverse=True)
         names = [segment.meshes[mesh].name for mesh in used]
         return np.array([self._prims.setdefault(name, len(self._prims)) for name in names])[rows].reshape(-1, 2)
-
-    def _content(self, summary: Summary, end: float) -> LayerContent:
-        """Returns the content of the layer, given the last time of its intervals."""
-        source = Path(os.path.relpath(Path(self._scene.path).resolve(), self.file.path.parent.resolve())).as_posix()
-        missing = str(not_listed(summary, with_end=True) or "")
-        keys = self._spool.keys()
-        return LayerContent(
-            metadata=self._metadata,
-            documentation=" ".join(
-                filter(
-                    None,
-                    ("Collisions found by warp-bsc replay.", SHOWN_BY, missing, summary.motion, summary.not_checked),
-                )
-            ),
-            custom=("collisions", self._facts(summary)),
-            asset={"name": f"Collisions in {Path(self._scene.path).name}", "version": f"warp-bsc {__version__}"},
-            sublayer=source if source.startswith("../") else f"./{source}",
-            root=self._root_path,
-            strings={"prims": list(self._prims)},
-            scopes=self._scopes({pair for pair, _ in keys}),
-            prims=[self._layer_prim(pair, name) for pair, name in keys],
-            variant_set="warp_bsc",
-            hidden=_hidden(keys),
-            samples=lambda prim, attribute: self._spool.time_samples(tuple(prim.split("/")), attribute, end),
-        )
 
     def _facts(self, summary: Summary) -> dict[str, Any]:
         """Returns what programs read of the layer without its prims."""

@@ -13,7 +13,8 @@ import numpy as np
 PrimKind = Literal["Mesh", "PointInstancer", "BasisCurves"]
 """The types of prims in a layer."""
 
-SHAPES = {"float3[]": ("f4", 3), "point3f[]": ("f4", 3), "float[]": ("f4", 1), "int[]": ("i4", 1), "int2[]": ("i4", 2)}
+SHAPES = {f"{name}[]": ("f4", 3) for name in ("float3", "point3f", "vector3f", "normal3f")}
+SHAPES |= {"float[]": ("f4", 1), "int[]": ("i4", 1), "int2[]": ("i4", 2)}
 """Type and number of the components of a row, by the type of an attribute."""
 
 _SAVED = 1 << 25  # bytes of samples that a layer holds in memory before it saves them
@@ -55,52 +56,8 @@ class LayerPrim:
     width: float = 0.0
 
 
-@dataclass(frozen=True)
-class LayerContent:
-    """The content of a layer.
-
-    Attributes:
-        metadata: Metadata of the layer, by name.
-        documentation: Text for people.
-        custom: Name of a dictionary of values for programs, and these by name; lists are of texts.
-        asset: The ``assetInfo`` of the root prim.
-        sublayer: Path of its sublayer, relative to its own folder. It is not read.
-        root: Path of the prim above all prims, of purpose guide.
-        strings: Attributes of that prim, lists of texts, by name.
-        scopes: The prims below it.
-        prims: The prims below these.
-        variant_set: Name of its variant set, whose first variant is selected.
-        hidden: Names of the scopes and prims that each variant hides.
-        samples: Yields the time samples of an attribute in order, given its prim and its name: time codes and arrays of
-            :data:`SHAPES`.
-    """
-
-    metadata: dict[str, Any]
-    documentation: str
-    custom: tuple[str, dict[str, Any]]
-    asset: dict[str, Any]
-    sublayer: str
-    root: str
-    strings: dict[str, list[str]]
-    scopes: list[LayerScope]
-    prims: list[LayerPrim]
-    variant_set: str
-    hidden: dict[str, list[str]]
-    samples: Callable[[str, str], Iterable[tuple[float, np.ndarray]]]
-
-
-def write_layer(content: LayerContent, path: Path, file_format: str) -> None:
-    """Writes a layer, with arguments and errors as of :func:`new_layer`."""
-    with new_layer(path, file_format) as (layer, add):
-        _define_prims(layer, content)
-        _describe(layer, content)
-        for prim, attribute, value_type in _attributes(content):
-            for time, value in content.samples(prim, attribute):
-                add(f"{content.root}/{prim}.{attribute}", time, _to_vt(value_type, value), value.nbytes)
-
-
 @contextlib.contextmanager
-def new_layer(path: Path, file_format: str) -> Iterator[tuple[Any, Callable[[str, float, Any, int], None]]]:
+def new_layer(path: Path, file_format: str) -> Iterator[tuple[Any, Callable[[str, str, float, np.ndarray], None]]]:
     """Makes a layer in USD's binary format, in which saved samples leave the memory, and saves it after the block.
 
     Args:
@@ -108,20 +65,23 @@ def new_layer(path: Path, file_format: str) -> Iterator[tuple[Any, Callable[[str
         file_format: ``"usdc"``, or ``"usda"`` for a text that is made of the binary layer in the end.
 
     Yields:
-        The layer, and a function that adds a sample to it, given the path of its attribute, its time code, its value
-        and its size [bytes].
+        The layer, and a function that adds a sample to it, given the path of its attribute and its type of
+        :data:`SHAPES`, its time code, and its value.
 
     Raises:
         OSError: If the file cannot be written.
     """
-    from pxr import Sdf, Tf  # noqa: PLC0415 (slow)
+    from pxr import Sdf, Tf, Vt  # noqa: PLC0415 (slow)
 
+    arrays = {("f4", 3): Vt.Vec3fArray, ("f4", 1): Vt.FloatArray, ("i4", 1): Vt.IntArray, ("i4", 2): Vt.Vec2iArray}
     waiting = 0
 
-    def add(attribute: str, time: float, value: Any, size: int) -> None:
+    def add(attribute: str, value_type: str, time: float, value: np.ndarray) -> None:
         nonlocal waiting
-        layer.SetTimeSample(attribute, time, value)
-        waiting += size
+        shape = SHAPES[value_type]
+        array = np.ascontiguousarray(value, shape[0])
+        layer.SetTimeSample(attribute, time, arrays[shape].FromNumpy(array))
+        waiting += array.nbytes
         if waiting > _SAVED:
             layer.Save()
             waiting = 0
@@ -142,35 +102,42 @@ def new_layer(path: Path, file_format: str) -> Iterator[tuple[Any, Callable[[str
         raise
 
 
-def _describe(layer, content):
-    """Sets the metadata of a layer."""
-    from pxr import Vt  # noqa: PLC0415 (slow)
+def define_prims(
+    layer: Any,
+    root: str,
+    asset: dict[str, Any],
+    strings: dict[str, list[str]],
+    scopes: Iterable[LayerScope],
+    prims: Iterable[LayerPrim],
+    variant_set: str,
+    hidden: dict[str, list[str]],
+) -> None:
+    """Defines the prims of a layer, without time samples.
 
-    name, values = content.custom
-    values = {name: Vt.StringArray(value) if isinstance(value, list) else value for name, value in values.items()}
-    layer.customLayerData = {name: values}
-    layer.documentation = content.documentation
-    for name, value in content.metadata.items():
-        layer.pseudoRoot.SetInfo(name, value)
-    layer.subLayerPaths.append(content.sublayer)
-
-
-def _define_prims(layer, content):
-    """Defines the prims of a layer, without time samples."""
+    Args:
+        layer: The layer, without sublayers.
+        root: Path of the prim above all prims, of purpose guide.
+        asset: Its ``assetInfo``.
+        strings: Its attributes, lists of texts, by name.
+        scopes: The prims below it.
+        prims: The prims below these.
+        variant_set: Name of its variant set, whose first variant is selected.
+        hidden: Names of the scopes and prims that each variant hides.
+    """
     from pxr import Sdf, Usd, UsdGeom, UsdShade  # noqa: PLC0415 (slow)
 
     stage = Usd.Stage.Open(layer)
-    root = UsdGeom.Scope.Define(stage, content.root)
-    root.CreatePurposeAttr(UsdGeom.Tokens.guide)
-    root.GetPrim().SetAssetInfo(content.asset)
-    _define_strings(root.GetPrim(), content.strings)
-    for scope in content.scopes:
-        prim = UsdGeom.Scope.Define(stage, f"{content.root}/{scope.name}").GetPrim()
+    top = UsdGeom.Scope.Define(stage, root)
+    top.CreatePurposeAttr(UsdGeom.Tokens.guide)
+    top.GetPrim().SetAssetInfo(asset)
+    _define_strings(top.GetPrim(), strings)
+    for scope in scopes:
+        prim = UsdGeom.Scope.Define(stage, f"{root}/{scope.name}").GetPrim()
         prim.SetDisplayName(scope.label)
         _define_strings(prim, scope.strings)
-    UsdGeom.Scope.Define(stage, f"{content.root}/Materials")
-    for part in content.prims:
-        prim = stage.DefinePrim(f"{content.root}/{part.name}", part.kind)
+    UsdGeom.Scope.Define(stage, f"{root}/Materials")
+    for part in prims:
+        prim = stage.DefinePrim(f"{root}/{part.name}", part.kind)
         for attribute, type_name in part.attributes.items():
             value_type = Sdf.ValueTypeNames.Find(type_name)
             if attribute.startswith("primvars:"):
@@ -189,8 +156,8 @@ def _define_prims(layer, content):
             shown = _define_marker(stage, prim, part.width / 2)
         # The same colour for programs that show no materials.
         UsdGeom.Gprim(shown).CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set([part.color])
-        UsdShade.MaterialBindingAPI.Apply(shown).Bind(_define_material(stage, content.root, part))
-    _define_variants(root.GetPrim(), content.variant_set, content.hidden)
+        UsdShade.MaterialBindingAPI.Apply(shown).Bind(_define_material(stage, root, part))
+    _define_variants(top.GetPrim(), variant_set, hidden)
 
 
 def _define_strings(prim, strings):
@@ -243,20 +210,6 @@ def _define_marker(stage, instancer, radius):
     marker.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     UsdGeom.PointInstancer(instancer).CreatePrototypesRel().SetTargets([marker.GetPath()])
     return marker.GetPrim()
-
-
-def _attributes(content) -> Iterator[tuple[str, str, str]]:
-    """Yields the attributes with time samples: names of their prims, their names, and their types."""
-    return ((prim.name, name, value_type) for prim in content.prims for name, value_type in prim.attributes.items())
-
-
-def _to_vt(value_type, array):
-    """Returns an array as a value of USD."""
-    from pxr import Vt  # noqa: PLC0415 (slow)
-
-    types = {"float3[]": Vt.Vec3fArray, "point3f[]": Vt.Vec3fArray, "float[]": Vt.FloatArray}
-    types |= {"int[]": Vt.IntArray, "int2[]": Vt.Vec2iArray}
-    return types[value_type].FromNumpy(array)
 
 
 def _as_os_error(error) -> Exception:

@@ -1,11 +1,9 @@
 """Writes a layer over a scene that gives meshes other points, with the normals, extents and velocities of these."""
 
 import os
-import secrets
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,8 +11,7 @@ import numpy as np
 from ..._atomic_file import OutputFile
 from ..scene import Scene
 from ..segment import Segment
-from .layer import just_before, layer_metadata
-from .layer_writer import new_layer
+from .layer import SceneLayer, just_before
 
 if TYPE_CHECKING:
     from ..read.meshes import UsdMesh  # which imports pxr
@@ -64,13 +61,8 @@ class PointsLayer:
             OSError: If the file cannot be written.
             ValueError: If its name has another suffix, or the scene has no file.
         """
-        suffix = Path(path).suffix
-        if suffix not in (".usda", ".usdc", ".usd"):
-            raise ValueError(f"{path}: the name of a layer of USD must end in .usda, .usdc or .usd")
-        self._format = "usda" if suffix == ".usda" else "usdc"
-        self._scene = scene
+        self._scene, self._layer = scene, SceneLayer(path, scene, "a layer of USD")
         self._moved: dict[str, dict[tuple[float, bool], tuple[int, int]]] = {}  # by name: places in the file, numbers
-        self._metadata = layer_metadata(scene)
         self.end: float | None = None
         self.file = OutputFile(path)
         self._moves = tempfile.TemporaryFile(buffering=0, dir=self.file.folder)  # noqa: SIM115 (closed by discard)
@@ -105,13 +97,13 @@ class PointsLayer:
             OSError: If the file cannot be written.
             ValueError: If the scene cannot be read again.
         """
-        path = Path(self.file.folder, f".warp-bsc-{secrets.token_hex(8)}.tmp")
-        with new_layer(path, self._format) as (layer, add):
-            self._describe(layer, facts)
+        documentation = "Points moved by warp-bsc repair, so that meshes do not collide."
+        if self.end is not None:
+            documentation += f" Partial: it ends at time {self.end:g}."
+        custom = {"repair": facts | {"complete": self.end is None}}
+        with self._layer.writing(self.file, documentation, custom, self.end) as (layer, add):
             for name in self._moved:
                 self._write_mesh(layer, name, add)
-        self.file.adopt(path)
-        self.file.commit()
 
     def shrink(self) -> bool:
         """Drops the last eighth of the times, and returns whether the layer becomes shorter."""
@@ -126,24 +118,9 @@ class PointsLayer:
         self._moves.close()
         self.file.discard()
 
-    def _describe(self, layer, facts) -> None:
-        """Sets the metadata of the layer."""
-        metadata = dict(self._metadata)
-        if self.end is not None:
-            metadata["endTimeCode"] = min(self.end, float(metadata["endTimeCode"]))
-        for name, value in metadata.items():
-            layer.pseudoRoot.SetInfo(name, value)
-        layer.customLayerData = {"repair": facts | {"complete": self.end is None}}
-        layer.documentation = "Points moved by warp-bsc repair, so that meshes do not collide."
-        if self.end is not None:
-            layer.documentation += f" Partial: it ends at time {self.end:g}."
-        source = os.path.relpath(Path(self._scene.path).resolve(), self.file.path.parent.resolve())
-        source = Path(source).as_posix()
-        layer.subLayerPaths.append(source if source.startswith("../") else f"./{source}")
-
     def _write_mesh(self, layer, name, add) -> None:
         """Writes the samples of one mesh by ``add``."""
-        from pxr import Sdf, Vt  # noqa: PLC0415 (slow)
+        from pxr import Sdf  # noqa: PLC0415 (slow)
 
         mesh = self._scene.prim_of(name)
         spec = Sdf.CreatePrimInLayer(layer, mesh.path)
@@ -166,8 +143,7 @@ class PointsLayer:
             for attribute, kind, value in surface.samples(old, new, added, time):
                 if not spec.attributes.get(attribute):
                     Sdf.AttributeSpec(spec, attribute, Sdf.ValueTypeNames.Find(kind))
-                array = Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(value, np.float32))
-                add(f"{mesh.path}.{attribute}", code, array, value.nbytes)
+                add(f"{mesh.path}.{attribute}", kind, code, value)
 
     def _times(self, mesh: "UsdMesh") -> list[tuple[float, bool]]:
         """Returns the times at which a mesh gets points, and whether the moment just before each is meant."""
