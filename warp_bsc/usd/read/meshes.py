@@ -86,8 +86,7 @@ class UsdMesh:
         root, breaks = (instance.root, instance.instancer.break_times) if instance else (None, set())
         breaks = breaks | visibility_times(prim, root)
         has_numbers = not self._strands or self._strands.has_edges  # points without edges have ids
-        where = f"{file}: {found.name}"
-        self._topologies = topologies = Topologies(self._polygons, breaks, has_numbers=has_numbers, where=where)
+        self._topologies = topologies = Topologies(self._polygons, breaks, has_numbers=has_numbers)
         self.is_empty = not any(topologies.digests)
         self._states = [
             topology if topology and is_shown(prim, root, code) else None
@@ -253,12 +252,12 @@ class UsdMesh:
             held = self._topologies.held(Usd.TimeCode(code.GetValue()) if at_time else code)
             points = self._polygons.read_points(held)
             if is_empty(points):
-                raise UnreadableError(f"{self._where}: the mesh has no points at time {time:g}")
+                raise ValueError(f"the mesh has no points at time {time:g}")
             if self._skin:
                 self._skin.deform(points, code)
             array = np.array(points)
             if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind != "f":
-                raise UnreadableError(f"{self._where}: attribute points holds {type(points).__name__}, not point3f[]")
+                raise ValueError(f"attribute points holds {type(points).__name__}, not point3f[]")
             if self.instanced_prim:
                 self._last_points.clear()
                 self._last_points[key] = array
@@ -304,9 +303,7 @@ class UsdMesh:
         points = self.read_points(time, before=before)
         with reading(self._where, self.name, time):
             if len(points) != point_count:
-                raise UnreadableError(
-                    f"{self._where}: {len(points)} points at time {time:g}, but {point_count} at first"
-                )
+                raise ValueError(f"{len(points)} points at time {time:g}, but {point_count} at first")
             return points[used].astype(dtype)
 
     def read_transform(self, time: float, *, before: bool = False) -> np.ndarray | None:
@@ -379,8 +376,8 @@ class UsdMesh:
             UnreadableError: If they refer to points that are not there.
         """
         with reading(self._where, self.name, time):
-            topology = self._topologies.read(self.time_code(time, False), self._where)
-            tets = topology.tetrahedra(point_count, self._where)
+            topology = self._topologies.read(self.time_code(time, False))
+            tets = topology.tetrahedra(point_count)
             return tets[:, [1, 0, 2, 3]] if self._is_left_handed else tets
 
     def read_strands(self, times: list[float], point_count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -400,14 +397,14 @@ class UsdMesh:
         if not self._strands:
             return np.zeros((0, 2), dtype=np.int64), np.full(point_count, -1), np.zeros(point_count)
         with reading(self._where, self.name, times[0]):
-            topology = self._topologies.read(self.time_code(times[0], False), self._where)
-            edges, curves = self._strands.read_edges(topology.counts, point_count, self._where)
+            topology = self._topologies.read(self.time_code(times[0], False))
+            edges, curves = self._strands.read_edges(topology.counts, point_count)
         own = sample_times(self._strands.width_attribute)
         radius = np.zeros(point_count)
         for time in sorted({*times, *(time for time in own if times[0] < time < times[-1])}) if own else times[:1]:
             with reading(self._where, self.name, time):
                 code = self.time_code(time, time == times[-1] > times[0])
-                radius = np.maximum(radius, 0.5 * self._strands.read_widths(code, curves, self._where))
+                radius = np.maximum(radius, 0.5 * self._strands.read_widths(code, curves))
         return edges, curves, radius * max(self._scales(times if self._placed_times else times[:1]))
 
     def _scales(self, times: list[float]) -> list[float]:
@@ -415,8 +412,8 @@ class UsdMesh:
 
     def _find_triangles(self, code, points, is_mirrored) -> tuple[np.ndarray, np.ndarray, int]:
         """Returns the result of :meth:`read_triangles`."""
-        topology = self._topologies.read(code, self._where)
-        triangles, polygons = topology.triangles(points, self._where)
+        topology = self._topologies.read(code)
+        triangles, polygons = topology.triangles(points)
         if self._is_left_handed != is_mirrored:
             triangles = triangles[:, ::-1]
         return triangles, polygons, len(topology.counts)
@@ -435,9 +432,9 @@ class UsdMesh:
         """Returns the matrix that transforms points, as rows, to world space, shape [4, 4]."""
         transform = self.read_transform(time, before=before)
         if transform is None:
-            raise UnreadableError(f"{self._where}: its instancer has no valid transform for it at time {time:g}")
+            raise ValueError(f"its instancer has no valid transform for it at time {time:g}")
         if not np.isfinite(transform).all():
-            raise UnreadableError(f"{self._where}: its transform is not finite at time {time:g}")
+            raise ValueError(f"its transform is not finite at time {time:g}")
         return transform
 
 

@@ -7,11 +7,12 @@ import numpy as np
 from pxr import Usd, UsdGeom
 
 from .shapes import Polygons
-from .unreadable import UnreadableError
 
 
 class Strands(Polygons):
     """The linear curves of a ``UsdGeom.BasisCurves`` prim, or the points of a ``UsdGeom.Points`` prim.
+
+    Errors are ValueErrors; :func:`~.unreadable.reading`, in which all of it is called, names the file and the prim.
 
     Attributes:
         has_edges: Whether they are curves.
@@ -68,29 +69,26 @@ class Strands(Polygons):
         points = self.read_points(time)
         return [None if points is None else [len(points)] * bool(len(points)), self._ids.Get(time), None]
 
-    def read_edges(self, counts: np.ndarray, point_count: int, where: str) -> tuple[np.ndarray, np.ndarray]:
+    def read_edges(self, counts: np.ndarray, point_count: int) -> tuple[np.ndarray, np.ndarray]:
         """Returns the edges of curves, and the curve of each point.
 
         Args:
             counts: Numbers of points of the curves, shape [curve_count].
             point_count: Number of points.
-            where: File and prim, for messages.
 
         Returns:
             The points at both ends of each edge, shape [n, 2], and curves, shape [point_count].
 
         Raises:
-            UnreadableError: If the numbers do not add up to the number of points, or one is less than 2.
+            ValueError: If the numbers do not add up to the number of points, or one is less than 2.
         """
         if not self.has_edges:
             return np.zeros((0, 2), dtype=np.int64), np.full(point_count, -1)
         if counts.min(initial=2) < 2:
             curve = int(np.argmin(counts))
-            raise UnreadableError(f"{where}: curve {curve} has {counts[curve]} points; 2 are the fewest")
+            raise ValueError(f"curve {curve} has {counts[curve]} points; 2 are the fewest")
         if counts.sum() != point_count:
-            raise UnreadableError(
-                f"{where}: curveVertexCounts add up to {counts.sum()}, but there are {point_count} points"
-            )
+            raise ValueError(f"curveVertexCounts add up to {counts.sum()}, but there are {point_count} points")
         curves = np.repeat(np.arange(len(counts)), counts)
         (first,) = np.nonzero(curves[1:] == curves[:-1])
         edges = np.stack([first, first + 1], axis=1)
@@ -99,16 +97,15 @@ class Strands(Polygons):
             edges = np.concatenate([edges, np.stack([last - counts + 1, last], axis=1)[counts > 2]])
         return edges, curves
 
-    def read_widths(self, time: Usd.TimeCode, curves: np.ndarray, where: str) -> np.ndarray:
+    def read_widths(self, time: Usd.TimeCode, curves: np.ndarray) -> np.ndarray:
         """Returns the width at each point, 0 if the file has none, in the space of the prim.
 
         Args:
             time: Time code.
             curves: Curve of each point, shape [point_count].
-            where: File and prim, for messages.
 
         Raises:
-            UnreadableError: If the number of widths is not that of their interpolation, or one is negative or not
+            ValueError: If the number of widths is not that of their interpolation, or one is negative or not
                 finite.
         """
         value = self._widths.ComputeFlattened(time) if self._widths else self.width_attribute.Get(time)
@@ -123,9 +120,9 @@ class Strands(Polygons):
         else:  # varying and vertex values are at the same points of linear curves
             count, rows = len(curves), np.arange(len(curves))
         if widths.shape != (count,):
-            raise UnreadableError(f"{where}: {len(widths)} widths of interpolation {interpolation}, which has {count}")
+            raise ValueError(f"{len(widths)} widths of interpolation {interpolation}, which has {count}")
         if not (np.isfinite(widths) & (widths >= 0.0)).all():
-            raise UnreadableError(f"{where}: widths must be finite and at least 0")
+            raise ValueError("widths must be finite and at least 0")
         return widths[rows]
 
 

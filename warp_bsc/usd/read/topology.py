@@ -1,4 +1,7 @@
-"""The polygons of a mesh, checked and triangulated. Imports pxr, which is slow: import this where used."""
+"""The polygons of a mesh, checked and triangulated. Imports pxr, which is slow: import this where used.
+
+Errors are ValueErrors; :func:`~.unreadable.reading`, in which all of it is called, names the file and the prim.
+"""
 
 import bisect
 import hashlib
@@ -12,7 +15,6 @@ from pxr import Usd, Vt
 from .samples import sample_times
 from .shapes import Polygons
 from .triangulation import triangulate
-from .unreadable import UnreadableError
 
 BROKEN = b"", b""
 """The digests of polygons of which a sample is blocked."""
@@ -39,56 +41,47 @@ class Topology(NamedTuple):
         polygons.update(self.indices.tobytes() + self.tets.tobytes())
         return polygons.digest(), hashlib.blake2b(self.holes.tobytes()).digest()
 
-    def triangles(self, points: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
+    def triangles(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns the polygons without the holes as triangles of the same orientation.
 
-        Args:
-            points: Points by which concave polygons are cut, shape [point_count, 3].
-            where: File and prim, for messages.
-
-        Returns:
-            The triangles' points, shape [triangle_count, 3], and the polygon that each is a part of, shape
-            [triangle_count].
+        The points, by which concave polygons are cut, have the shape [point_count, 3]. The triangles' points have the
+        shape [triangle_count, 3]; and the polygon that each is a part of, [triangle_count].
 
         Raises:
-            UnreadableError: If the polygons are broken, or all of them are holes.
+            ValueError: If the polygons are broken, or all of them are holes.
         """
         counts, indices, holes, _ = self
         if not len(counts):
-            raise UnreadableError(f"{where}: the mesh has no faces")
+            raise ValueError("the mesh has no faces")
         if counts.min() < 3:
             face = int(np.argmin(counts))
-            raise UnreadableError(f"{where}: face {face} has {counts[face]} vertices; 3 are the fewest")
+            raise ValueError(f"face {face} has {counts[face]} vertices; 3 are the fewest")
         if counts.sum() != indices.size:
-            raise UnreadableError(
-                f"{where}: faceVertexCounts add up to {counts.sum()}, but there are {indices.size} faceVertexIndices"
+            raise ValueError(
+                f"faceVertexCounts add up to {counts.sum()}, but there are {indices.size} faceVertexIndices"
             )
         outside = (indices < 0) | (indices >= len(points))
         if outside.any():
             corner = int(np.argmax(outside))
             face = int(np.searchsorted(np.cumsum(counts), corner, side="right"))
-            raise UnreadableError(
-                f"{where}: face {face} refers to vertex {indices[corner]}, but the mesh has {len(points)} points"
-            )
+            raise ValueError(f"face {face} refers to vertex {indices[corner]}, but the mesh has {len(points)} points")
         triangles, polygons = triangulate(counts, indices, points)
         solid = ~np.isin(polygons, holes)
         if not solid.any():
-            raise UnreadableError(f"{where}: all faces of the mesh are holes")
+            raise ValueError("all faces of the mesh are holes")
         return triangles[solid], polygons[solid]
 
-    def tetrahedra(self, point_count: int, where: str) -> np.ndarray:
+    def tetrahedra(self, point_count: int) -> np.ndarray:
         """Returns the points of the tetrahedra, shape [tet_count, 4].
 
         Raises:
-            UnreadableError: If there is no such point.
+            ValueError: If there is no such point.
         """
         tets = self.tets.reshape(-1, 4)
         (bad,) = np.nonzero(((tets < 0) | (tets >= point_count)).any(axis=1))
         if len(bad):
             points = ", ".join(map(str, tets[bad[0]].tolist()))
-            raise UnreadableError(
-                f"{where}: tetrahedron {bad[0]} has the vertices {points}, but the mesh has {point_count} points"
-            )
+            raise ValueError(f"tetrahedron {bad[0]} has the vertices {points}, but the mesh has {point_count} points")
         return tets
 
 
@@ -102,17 +95,16 @@ class Topologies:
             such as a fluid before it flows. Where a sample is blocked it is not empty, but broken.
     """
 
-    def __init__(self, polygons: Polygons, times: set[float], *, has_numbers: bool, where: str):
+    def __init__(self, polygons: Polygons, times: set[float], *, has_numbers: bool):
         """Reads the polygons.
 
         Args:
             polygons: Their attributes.
             times: Time codes at which the mesh changes for other reasons.
             has_numbers: Whether the polygons tell which points stay the same from one sample to the next.
-            where: File and prim, for messages.
 
         Raises:
-            UnreadableError: If an attribute is not a list of integers.
+            ValueError: If an attribute is not a list of integers.
         """
         self._polygons = polygons
         self.times = (-math.inf, *sorted(times | sample_times(*polygons.topology_attributes)))
@@ -122,7 +114,7 @@ class Topologies:
         for code in self.codes:
             values = polygons.read_topology(code)
             if not last or any(old is not new and old != new for old, new in zip(last, values, strict=True)):
-                topology = as_topology(values, where)
+                topology = as_topology(values)
                 has_elements = len(topology.counts) > 0
                 without = BROKEN if values[0] is None else None
                 self.digests.append(topology.digests() if has_elements else without)
@@ -136,9 +128,9 @@ class Topologies:
         are_renumbered = len({own for own, _ in filter(None, self.digests)}) > 1
         self._numbered_times = sorted(sample_times(*polygons.point_attributes)) * (are_renumbered and has_numbers)
 
-    def read(self, time: Usd.TimeCode, where: str) -> Topology:
+    def read(self, time: Usd.TimeCode) -> Topology:
         """Returns the polygons at a time, with errors as of :func:`as_topology`."""
-        return as_topology(self._polygons.read_topology(time), where)
+        return as_topology(self._polygons.read_topology(time))
 
     def held(self, code: Usd.TimeCode) -> Usd.TimeCode:
         """Returns the time code of the last sample of the points where the next one is of other polygons, else a code.
@@ -157,21 +149,19 @@ class Topologies:
         return code
 
 
-def as_topology(values: Sequence[Any], where: str) -> Topology:
-    """Returns the polygons of a mesh; missing attributes are read as empty ones.
+def as_topology(values: Sequence[Any]) -> Topology:
+    """Returns the polygons of a mesh, given what :class:`~warp_bsc.usd.read.shapes.Polygons` read at a time.
 
-    Args:
-        values: What :class:`~warp_bsc.usd.read.shapes.Polygons` read at a time.
-        where: File and prim, for messages.
+    Missing attributes are read as empty ones.
 
     Raises:
-        UnreadableError: If an attribute is not a list of integers.
+        ValueError: If an attribute is not a list of integers.
     """
 
     def as_integers(name, value) -> np.ndarray:
         array = np.array(Vt.IntArray() if value is None else value)
         if array.ndim != 1 or array.dtype.kind not in "iu":
-            raise UnreadableError(f"{where}: {name} is not a list of integers")
+            raise ValueError(f"{name} is not a list of integers")
         return array.astype(np.int64)
 
     names = "faceVertexCounts", "faceVertexIndices", "holeIndices", "tetVertexIndices"
