@@ -23,7 +23,7 @@ from .options import (
     several,
 )
 from .query_file import KINDS, find_query_files, read_query_file
-from .query_tables import QueryResults, print_queries, queries_to_dict
+from .query_tables import answers_of, print_queries, results_of
 from .tables import Console
 
 _DESCRIPTION = """\
@@ -81,14 +81,15 @@ def _run(arguments: argparse.Namespace) -> int:
     with loading_kernels(device):
         for kind in {file.kind for file in files}:
             _QUERIES[kind](np.zeros((1, 8, 3)), **options)
-    results = []
+    rows = []
     for file in files:
         start = time.perf_counter()
         result = _QUERIES[file.kind](file.points, **options)
-        results.append(QueryResults(file, result, 1e3 * (time.perf_counter() - start)))
-    settings = {"method": arguments.method, "device": str(device), "min_distance": arguments.min_distance}
+        row = results_of(file, result, 1e3 * (time.perf_counter() - start))
+        rows.append(row | answers_of(result) if arguments.json else row)
+    found = {"method": arguments.method, "device": str(device), "min_distance": arguments.min_distance, "files": rows}
     if arguments.json:
-        print(json.dumps(queries_to_dict(results, **settings)))
+        print(json.dumps(found))
     else:
-        print_queries(Console(), results, **settings)
-    return ExitStatus.FOUND if arguments.fail_on and any(file.hits for file in results) else ExitStatus.DONE
+        print_queries(Console(), found)
+    return ExitStatus.FOUND if arguments.fail_on and any(row["hits"] for row in rows) else ExitStatus.DONE

@@ -2,8 +2,8 @@
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
 from operator import itemgetter
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -16,96 +16,58 @@ from .tables import print_table, say
 _STATUS = ("free", "hit", "unsure")  # by the value of query_vertex_face(...).status
 
 
-@dataclass(frozen=True)
-class QueryResults:
-    """The results of the queries of a file.
+def results_of(file: QueryFile, result: QueryResult, milliseconds: float) -> dict[str, Any]:
+    """Returns numbers of the results of a file as plain data for JSON, with the time to decide all of them [ms].
 
-    Attributes:
-        file: The queries.
-        result: Their results.
-        milliseconds: Time to decide all of them [ms].
+    ``certified`` has the numbers of queries that floating point certified as free, as hits, and could not certify;
+    ``confusion`` those of true and false positives and negatives, None if the truth is not known.
     """
-
-    file: QueryFile
-    result: QueryResult
-    milliseconds: float
-
-    @property
-    def hits(self) -> int:
-        """Number of queries decided as collisions."""
-        return int(self.result.hit.sum())
-
-    @property
-    def certified(self) -> dict[str, int]:
-        """Number of queries that floating point certified as free, as hits, and could not certify."""
-        return {name: int((self.result.status == code).sum()) for code, name in enumerate(_STATUS)}
-
-    @property
-    def confusion(self) -> dict[str, int] | None:
-        """Number of true and false positives and negatives; None if the truth is not known."""
-        hit, truth = self.result.hit, self.file.truth
-        if truth is None:
-            return None
-        return {
+    hit, truth = result.hit, file.truth
+    confusion = None
+    if truth is not None:
+        confusion = {
             "true_positives": int((hit & truth).sum()),
             "false_positives": int((hit & ~truth).sum()),
             "true_negatives": int((~hit & ~truth).sum()),
             "false_negatives": int((~hit & truth).sum()),
         }
+    return {
+        "path": str(file.path),
+        "kind": file.kind,
+        "queries": len(file.points),
+        "hits": int(hit.sum()),
+        "certified": {name: int((result.status == code).sum()) for code, name in enumerate(_STATUS)},
+        "truth_path": str(file.truth_path) if file.truth_path else None,
+        "confusion": confusion,
+        "milliseconds": milliseconds,
+    }
 
 
-def print_queries(
-    console: Console, results: list[QueryResults], *, method: str, device: str, min_distance: float
-) -> None:
-    """Prints the results of query files and compares them with the truth, where that is known.
+def answers_of(result: QueryResult) -> dict[str, Any]:
+    """Returns the result of each query as plain data for JSON."""
+    toi = None if result.toi is None else [toi if toi <= 1.0 else None for toi in result.toi]
+    return {"hit": result.hit.tolist(), "status": [_STATUS[status] for status in result.status], "toi": toi}
 
-    Args:
-        console: The terminal or file to print to.
-        results: The results of each file.
-        method: The method.
-        device: The device.
-        min_distance: Distance up to which pairs collide; 0 if they must touch.
-    """
-    folder = os.path.commonpath([found.file.path.absolute().parent for found in results])
-    distance = f"; minimum distance {min_distance:g}" if min_distance else ""
-    say(console, f"{count(len(results), 'file')} in {folder}; method {method} on {device}{distance}")
+
+def print_queries(console: Console, found: dict[str, Any]) -> None:
+    """Prints the JSON of the results of query files, and compares them with the truth, where that is known."""
+    rows = found["files"]
+    folder = os.path.commonpath([Path(row["path"]).absolute().parent for row in rows])
+    distance = f"; minimum distance {found['min_distance']:g}" if found["min_distance"] else ""
+    where = f"method {found['method']} on {found['device']}{distance}"
+    say(console, f"{count(len(rows), 'file')} in {folder}; {where}")
     say(console, "Free, hit and unsure: the certificates of floating point, the same for every method.")
-    names = [os.path.relpath(found.file.path.with_suffix(""), folder) for found in results]
-    numbers = [(len(a.file.points), a.hits, *a.certified.values(), a.milliseconds) for a in results]
+    names = [os.path.relpath(Path(row["path"]).with_suffix(""), folder) for row in rows]
+    numbers = [(row["queries"], row["hits"], *row["certified"].values(), row["milliseconds"]) for row in rows]
     _print_sums(console, ("File", "Queries", "Hits", "Free", "Hit", "Unsure", "ms"), names, numbers)
-    known = [(name, found.confusion) for name, found in zip(names, results, strict=True) if found.confusion]
+    known = [(name, row["confusion"]) for name, row in zip(names, rows, strict=True) if row["confusion"]]
     if known:
         console.print()
         headers = ("Against the truth", "True\npos.", "False\npos.", "True\nneg.", "False\nneg.")
         _print_sums(console, headers, [name for name, _ in known], [tuple(counts.values()) for _, counts in known])
-    for file in (found.file for found in results):
-        if file.truth_path and file.truth_path != file.path:
-            say(console, f"Truth of {file.path.name} from {file.truth_path.name}.")
-
-
-def queries_to_dict(results: list[QueryResults], *, method: str, device: str, min_distance: float) -> dict[str, Any]:
-    """Returns the results as plain data for JSON; arguments as of :func:`print_queries`."""
-    return {
-        "method": method,
-        "device": device,
-        "min_distance": min_distance,
-        "files": [
-            {
-                "path": str(found.file.path),
-                "kind": found.file.kind,
-                "queries": len(found.file.points),
-                "hits": found.hits,
-                "certified": found.certified,
-                "truth_path": str(found.file.truth_path) if found.file.truth_path else None,
-                "confusion": found.confusion,
-                "milliseconds": found.milliseconds,
-                "hit": found.result.hit.tolist(),
-                "status": [_STATUS[status] for status in found.result.status],
-                "toi": None if found.result.toi is None else [toi if toi <= 1.0 else None for toi in found.result.toi],
-            }
-            for found in results
-        ],
-    }
+    for row in rows:
+        if row["truth_path"] and row["truth_path"] != row["path"]:
+            say(console, f"Truth of {Path(row['path']).name} from {Path(row['truth_path']).name}.")
 
 
 def _print_sums(
