@@ -19,7 +19,7 @@ from warp_bsc.bench.peers.ipc_toolkit import time_queries
 from warp_bsc.bench.scenes.detector import load_intervals, load_scene, paper_scenes
 from warp_bsc.cli.main import main
 from warp_bsc.detection.run.launch import cores
-from warp_bsc.detection.run.settings import PairKind
+from warp_bsc.detection.run.settings import SURFACE_KINDS, PairKind
 
 TINY = Effort(intervals=2, queries=3000, sample=100, ipc_queries=20, adversaries=50, repeat=1)
 
@@ -97,7 +97,7 @@ def test_the_ipc_toolkit_is_measured(capsys):
 
 
 @pytest.mark.parametrize(("query", "expected"), [(350, 250), (60, 0)])
-@pytest.mark.parametrize("kind", PairKind, ids=lambda kind: kind.label)
+@pytest.mark.parametrize("kind", SURFACE_KINDS, ids=lambda kind: kind.label)
 def test_what_a_call_takes_is_taken_off(monkeypatch, kind, query, expected):
     """By a clock that a call advances by 100 ns, where the features are far apart, and a query otherwise."""
     clock = SimpleNamespace(now=0.0)
@@ -114,7 +114,7 @@ def test_what_a_call_takes_is_taken_off(monkeypatch, kind, query, expected):
 
 def test_wrong_answers_are_counted(monkeypatch):
     """Against a checker that says the opposite, every answer that was checked is wrong."""
-    for kind in PairKind:
+    for kind in SURFACE_KINDS:
         truth = getattr(checker, kind.label)
         monkeypatch.setattr(checker, kind.label, lambda points, truth=truth: ~truth(points))
     places = find_places([wp.get_device("cpu")])[:1]

@@ -13,7 +13,7 @@ from warp_bsc.bench.measure import queries as bench_queries
 from warp_bsc.bench.measure.queries import MODES, benchmark_queries
 from warp_bsc.bench.scenes.queries import generate_queries, generate_touching_queries
 from warp_bsc.cli.main import main
-from warp_bsc.detection.run.settings import PairKind
+from warp_bsc.detection.run.settings import SURFACE_KINDS, PairKind
 
 
 def measure(capsys, device, *arguments):
@@ -24,7 +24,7 @@ def measure(capsys, device, *arguments):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", PairKind, ids=lambda kind: kind.label)
+@pytest.mark.parametrize("kind", SURFACE_KINDS, ids=lambda kind: kind.label)
 def test_answers_are_true(kind, device):
     _, status = benchmark_queries(kind, count=1000, device=device, repeat=1)
     truth = getattr(checker, kind.label)(generate_queries(kind, 1000, device=device).numpy())
@@ -34,7 +34,7 @@ def test_answers_are_true(kind, device):
     assert 20 < truth.sum() < 200
 
 
-@pytest.mark.parametrize("kind", PairKind, ids=lambda kind: kind.label)
+@pytest.mark.parametrize("kind", SURFACE_KINDS, ids=lambda kind: kind.label)
 def test_culls_leave_a_third(kind, device):
     measured, status = benchmark_queries(kind, device=device, repeat=1)
     assert len(status) == measured["queries"] == (2**24 if device.is_cuda else 2**18)
@@ -42,14 +42,14 @@ def test_culls_leave_a_third(kind, device):
     assert measured["certified"]["hit"] + measured["certified"]["unsure"] < measured["survivors"]
 
 
-@pytest.mark.parametrize("kind", PairKind, ids=lambda kind: kind.label)
+@pytest.mark.parametrize("kind", SURFACE_KINDS, ids=lambda kind: kind.label)
 def test_queries_depend_on_neither_device_nor_count(kind, device):
     many, few = generate_queries(kind, 1000, device=device).numpy(), generate_queries(kind, 10, device="cpu").numpy()
     assert np.array_equal(many[:10], few)
     assert len(np.unique(many.reshape(1000, -1), axis=0)) == 1000
 
 
-@pytest.mark.parametrize("kind", PairKind, ids=lambda kind: kind.label)
+@pytest.mark.parametrize("kind", SURFACE_KINDS, ids=lambda kind: kind.label)
 def test_touching_queries_are_for_exact_arithmetic_to_decide(kind, device):
     query = getattr(bsc, f"query_{kind.label}")
     points = generate_touching_queries(kind, 2000, device=device).numpy()
@@ -66,7 +66,7 @@ def test_a_wrong_exact_answer_is_noticed(monkeypatch, device):
 
 @pytest.mark.parametrize(("mode", "kernels"), [("impact", slice(1, 2)), ("queued", slice(2, 4))])
 def test_other_answers_are_noticed(monkeypatch, device, mode, kernels):
-    right, wrong = (list(bench_queries._kernels(kind)) for kind in PairKind)
+    right, wrong = (list(bench_queries._kernels(kind)) for kind in SURFACE_KINDS)
     right[kernels] = wrong[kernels]
     monkeypatch.setattr(bench_queries, "_kernels", lambda kind: right)
     with pytest.raises(RuntimeError, match=f"decided differently by mode {mode}"):
@@ -77,7 +77,7 @@ def test_json_is_consistent(capsys, device):
     found = json.loads(measure(capsys, device, "--count", "1000", "--json"))
     assert (found["benchmark"], found["device"], found["repeat"]) == ("queries", str(device), 2)
     assert [measured["kind"] for measured in found["kinds"]] == ["vertex-face", "edge-edge"]
-    for kind, measured in zip(PairKind, found["kinds"], strict=True):
+    for kind, measured in zip(SURFACE_KINDS, found["kinds"], strict=True):
         _, status = benchmark_queries(kind, count=1000, device=device, repeat=1)
         assert measured["certified"] == dict(
             zip(("free", "hit", "unsure"), np.bincount(status, minlength=3), strict=True)
@@ -134,19 +134,19 @@ def write_queries(folder, kind, points):
 
 def test_methods_are_measured_on_files(capsys, monkeypatch, tmp_path, device):
     rng = np.random.default_rng(1)
-    points = {kind: GENERATORS["integer_lattice"](rng, 50, kind.label, np.float64) for kind in PairKind}
-    for kind in PairKind:
+    points = {kind: GENERATORS["integer_lattice"](rng, 50, kind.label, np.float64) for kind in SURFACE_KINDS}
+    for kind in SURFACE_KINDS:
         write_queries(tmp_path / "lattice", kind.display_name, points[kind])
     monkeypatch.setenv("COLUMNS", "80")
     monkeypatch.setattr(methods, "_SMALLEST_LAUNCH", {False: 2**10, True: 2**10})  # the times may be inexact
     lines = measure(capsys, device, str(tmp_path / "lattice")).splitlines()
     assert max(map(len, lines)) <= 80
-    assert sum("lattice," in line for line in lines) == len(PairKind)
-    for kind in PairKind:  # in a line of its own beside long times
+    assert sum("lattice," in line for line in lines) == len(SURFACE_KINDS)
+    for kind in SURFACE_KINDS:  # in a line of its own beside long times
         assert sum(kind.display_name in line for line in lines) == 1
     measured = json.loads(measure(capsys, device, str(tmp_path / "lattice"), "--json"))["queries"]
     by_kind = {row["kind"]: row for row in measured}
-    for kind in PairKind:
+    for kind in SURFACE_KINDS:
         row = by_kind[kind.display_name]
         truth = getattr(checker, kind.label)(points[kind])
         assert (row["name"], row["queries"], row["hits"]) == ("lattice", 50, truth.sum())

@@ -13,7 +13,7 @@ from warp_bsc.detection.broad.broad_phase_hierarchy import BroadPhaseHierarchy
 from warp_bsc.detection.broad.broad_phase_simd import BroadPhaseSimd
 from warp_bsc.detection.narrow.on_host import pair_distances
 from warp_bsc.detection.narrow.rings import make_rings
-from warp_bsc.detection.run.settings import DistanceKind
+from warp_bsc.detection.run.settings import PairKind
 
 
 def scene(dtype, seed=1):
@@ -44,16 +44,16 @@ def all_pairs(mesh, radius, x0, x1, rings):
     free[mesh.free_edges] = True
     found = {}
     for kind, firsts, seconds, elements in (
-        (DistanceKind.VERTEX_FACE, mesh.vertices, np.arange(len(mesh.faces)), mesh.faces),
-        (DistanceKind.EDGE_EDGE, np.arange(len(mesh.edges)), np.arange(len(mesh.edges)), mesh.edges),
-        (DistanceKind.VERTEX_EDGE, mesh.points, mesh.free_edges, mesh.edges),
-        (DistanceKind.VERTEX_VERTEX, mesh.points, mesh.points, mesh.edges),
+        (PairKind.VERTEX_FACE, mesh.vertices, np.arange(len(mesh.faces)), mesh.faces),
+        (PairKind.EDGE_EDGE, np.arange(len(mesh.edges)), np.arange(len(mesh.edges)), mesh.edges),
+        (PairKind.VERTEX_EDGE, mesh.points, mesh.free_edges, mesh.edges),
+        (PairKind.VERTEX_VERTEX, mesh.points, mesh.points, mesh.edges),
     ):
         pairs = np.stack(np.meshgrid(firsts, seconds, indexing="ij"), axis=-1).reshape(-1, 2).astype(np.int32)
-        if kind in (DistanceKind.EDGE_EDGE, DistanceKind.VERTEX_VERTEX):
+        if kind in (PairKind.EDGE_EDGE, PairKind.VERTEX_VERTEX):
             pairs = pairs[pairs[:, 0] < pairs[:, 1]]
         corners, distance = pair_distances(kind, elements, pairs, radius)
-        first = 2 if kind == DistanceKind.EDGE_EDGE else 1
+        first = 2 if kind == PairKind.EDGE_EDGE else 1
         apart = ~joined[corners[:, :first, None], corners[:, None, first:]].any(axis=(1, 2))
         if mesh.world is not None:
             apart &= mesh.world[corners[:, 0]] == mesh.world[corners[:, -1]]

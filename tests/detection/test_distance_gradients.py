@@ -8,7 +8,7 @@ from test_detector_min_distance import scene
 import warp_bsc as bsc
 from warp_bsc import checker
 from warp_bsc.detection.narrow.on_host import pair_distances
-from warp_bsc.detection.run.settings import DistanceKind
+from warp_bsc.detection.run.settings import PairKind
 
 
 def detect(device, method="conservative"):
@@ -28,12 +28,12 @@ def test_gradients_are_those_of_central_differences_of_the_exact_times(device):
     x = np.stack([array.numpy() for array in positions])
     rng = np.random.default_rng(3)
     checked = 0
-    for kind in DistanceKind:
+    for kind in PairKind:
         pairs, toi = getattr(collisions, kind.label), getattr(collisions.arrays, f"{kind.label}_toi")
         grazing = getattr(collisions.arrays, f"{kind.label}_grazing").numpy()
         np.testing.assert_array_equal(toi.numpy(), getattr(collisions, f"{kind.label}_toi"))
         np.testing.assert_array_equal(grazing, toi.numpy() == 0.0)  # these are within their distance from the start
-        elements = mesh.faces if kind == DistanceKind.VERTEX_FACE else mesh.edges
+        elements = mesh.faces if kind == PairKind.VERTEX_FACE else mesh.edges
         corners, distances = pair_distances(kind, elements, pairs, radius)
         for i in rng.permutation(np.flatnonzero(~grazing))[:12]:
             tape.zero()
@@ -56,11 +56,11 @@ def test_gradients_are_those_of_central_differences_of_the_exact_times(device):
 def test_pairs_that_start_within_their_distance_have_none(device):
     """Their time is 0 whatever the points; coordinates and normals have no gradients at all."""
     collisions, tape, _mesh, _radius, positions = detect(device, "exact")
-    for kind in DistanceKind:
+    for kind in PairKind:
         grazing = getattr(collisions.arrays, f"{kind.label}_grazing").numpy()
         assert grazing.any()
         getattr(collisions.arrays, f"{kind.label}_toi").grad.assign(grazing.astype(float))
-        for name in ("normal", "coordinates") if kind != DistanceKind.VERTEX_VERTEX else ("normal",):
+        for name in ("normal", "coordinates") if kind != PairKind.VERTEX_VERTEX else ("normal",):
             array = getattr(collisions.arrays, f"{kind.label}_{name}")
             np.testing.assert_array_equal(array.numpy(), getattr(collisions, f"{kind.label}_{name}"))
             assert not array.requires_grad
@@ -85,7 +85,7 @@ def test_gradients_in_a_graph_are_those_without(device):
         else:
             with tape:
                 collisions = detector.detect(*positions)
-        for kind in DistanceKind:
+        for kind in PairKind:
             getattr(collisions.arrays, f"{kind.label}_toi").grad.fill_(1.0)
         tape.backward()
         gradients.append([array.grad.numpy() for array in positions])

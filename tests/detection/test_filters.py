@@ -6,9 +6,9 @@ from filters import left_in, random_bits
 
 import warp_bsc as bsc
 from warp_bsc.detection.at_rest.intersections import IntersectionFinder
-from warp_bsc.detection.run.settings import DistanceKind
+from warp_bsc.detection.run.settings import PairKind
 
-KINDS = [kind.label for kind in DistanceKind]
+KINDS = [kind.label for kind in PairKind]
 
 
 def scene(seed):

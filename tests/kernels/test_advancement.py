@@ -12,7 +12,7 @@ from sheets import crumpled
 import warp_bsc as bsc
 from warp_bsc.detection.pipeline import DetectionPipeline
 from warp_bsc.detection.run.launch import retry_until_fits
-from warp_bsc.detection.run.settings import DistanceKind
+from warp_bsc.detection.run.settings import PairKind
 from warp_bsc.kernels.min_distance import _cleared_until
 from warp_bsc.kernels.motion import motion_and_distance
 from warp_bsc.kernels.polynomials import EDGE_EDGE, VERTEX_FACE
@@ -108,7 +108,7 @@ def found_contacts(mesh, x0, x1, **options):
 def test_most_pairs_are_not_subdivided(device):
     x0, x1, faces = crumpled(1, n=12)
     pipeline = found_contacts(bsc.CollisionMesh(faces, len(x0)), x0, x1, min_distance=0.0007)
-    for kind in (DistanceKind.VERTEX_FACE, DistanceKind.EDGE_EDGE):
+    for kind in (PairKind.VERTEX_FACE, PairKind.EDGE_EDGE):
         counts = pipeline.counts.pairs[kind]
         assert 0 < counts.subdivided < 0.2 * counts.survivors
 

@@ -26,7 +26,7 @@ from warp_bsc.detection.narrow.rings import Rings
 from warp_bsc.detection.narrow.rules.distance import run_distances
 from warp_bsc.detection.run.launch import cores
 from warp_bsc.detection.run.phase_timer import PhaseTimer
-from warp_bsc.detection.run.settings import Count, DistanceKind, PairCounts
+from warp_bsc.detection.run.settings import Count, PairCounts, PairKind
 
 TOLERANCE = 2.0**-20
 ITERATIONS = 20000  # of Tight-Inclusion: with its own limit of 10^7, a few of the queries take minutes each
@@ -140,7 +140,7 @@ def time_queries(kind, points, distance, timed, repeat):
     elements = vertices.reshape(-1, 2) if kind == "edge_edge" else np.ascontiguousarray(vertices[:, 1:])
     pairs = np.stack([2 * rows, 2 * rows + 1] if kind == "edge_edge" else [4 * rows, rows], axis=1)
     counts = wp.zeros(len(Count), dtype=wp.int64)
-    phase = NarrowPhase(DistanceKind[kind.upper()], counts, len(rows), pairs[-1] + 1)
+    phase = NarrowPhase(PairKind[kind.upper()], counts, len(rows), pairs[-1] + 1)
     phase.queue.assign(pairs)
     x0, x1 = (wp.array(x.reshape(-1, 3), dtype=wp.vec3d) for x in (points[:, :4], points[:, 4:]))
     inputs = x0, x1, wp.array(radius.ravel(), dtype=wp.float64), Rings()

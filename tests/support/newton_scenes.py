@@ -7,7 +7,7 @@ import warp as wp
 import warp_bsc as bsc
 from warp_bsc import checker
 from warp_bsc.detection.narrow.on_host import pair_distances
-from warp_bsc.detection.run.settings import DistanceKind
+from warp_bsc.detection.run.settings import PairKind
 from warp_bsc.response.state.mesh import ModelMesh
 
 DT = 1.0 / 240.0
@@ -290,11 +290,11 @@ class DistanceRollout(Rollout):
         before, after = self.start, self.vertices(self.states[0])
         found = self.distances.detect(before, after)
         at_rest = self.distances.find_proximities(before, 2.0 * self.radius.max())
-        pairs_at_rest = [getattr(at_rest, kind.label) for kind in DistanceKind]
+        pairs_at_rest = [getattr(at_rest, kind.label) for kind in PairKind]
         starts = np.split(at_rest.distance, np.cumsum([len(pairs) for pairs in pairs_at_rest])[:-1])
-        for kind, near, starts_of_kind in zip(DistanceKind, pairs_at_rest, starts, strict=True):
+        for kind, near, starts_of_kind in zip(PairKind, pairs_at_rest, starts, strict=True):
             pairs = getattr(found, kind.label)
-            elements = self.mesh.faces if kind == DistanceKind.VERTEX_FACE else self.mesh.edges
+            elements = self.mesh.faces if kind == PairKind.VERTEX_FACE else self.mesh.edges
             corners, distance = pair_distances(kind, elements, pairs, self.radius)
             known = dict(zip(map(tuple, near.tolist()), starts_of_kind, strict=True))
             start = np.array([known.get(tuple(pair), np.inf) for pair in pairs.tolist()])

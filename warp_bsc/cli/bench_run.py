@@ -37,7 +37,7 @@ from ..bench.scenes.repair import KNOWN, damaged, load_tangled
 from ..bench.tables import Table
 from ..bench.timing import count_threads, limited_threads
 from ..detection.run.launch import cores
-from ..detection.run.settings import PairKind
+from ..detection.run.settings import SURFACE_KINDS, PairKind
 from ..mesh_files.mesh_file import is_mesh_file
 from .device import find_device, load_detector, loading_kernels
 from .interrupts import INTERRUPTS
@@ -279,9 +279,9 @@ def _measure_random(arguments: argparse.Namespace, device: wp.Device) -> None:
 
     def measure() -> Generator[dict[str, Any], None, None]:
         with loading_kernels(device):
-            for kind in PairKind:
+            for kind in SURFACE_KINDS:
                 queries.benchmark_queries(kind, count=1, device=device, repeat=1)
-        for kind in PairKind:
+        for kind in SURFACE_KINDS:
             yield queries.benchmark_queries(kind, count=arguments.count, device=device, repeat=arguments.repeat)[0]
 
     copy_rate = queries.benchmark_copy(device=device, repeat=arguments.repeat)
@@ -291,7 +291,7 @@ def _measure_random(arguments: argparse.Namespace, device: wp.Device) -> None:
 
 def _measure_files(arguments: argparse.Namespace, device: wp.Device) -> None:
     """Measures the methods on the queries of files."""
-    kinds = {kind.display_name: kind for kind in PairKind}
+    kinds = {kind.display_name: kind for kind in SURFACE_KINDS}
     points: dict[tuple[str, PairKind], list[np.ndarray]] = {}
     for path in arguments.paths:
         for file in find_query_files([path]):

@@ -17,7 +17,7 @@ from .results.collision_finder import CollisionFinder
 from .results.collisions import Candidates, CapturedCollisions, Collisions, FreeStep
 from .run.host_function import run_on_host
 from .run.launch import retry_until_fits
-from .run.settings import TOLERANCE, DistanceKind, Method
+from .run.settings import TOLERANCE, Method, PairKind
 
 _SAMPLED = 64
 """Vertices whose collisions bound the earliest time of impact. In 92,230 triangles these take a twelfth of all."""
@@ -184,9 +184,9 @@ class CollisionDetector:
         pipeline = self._pipeline
         retry_until_fits(lambda: pipeline.find_candidates(x0, x1), pipeline, self.mesh.device)
         self._finder.check_counted_finite(x0, x1)
-        found = {kind.label: np.zeros((0, 2), dtype=np.int32) for kind in DistanceKind}
+        found = {kind.label: np.zeros((0, 2), dtype=np.int32) for kind in PairKind}
         for phase in pipeline.narrow_phases:
-            kind = DistanceKind(phase.kind)
+            kind = phase.kind
             pairs = phase.queue.numpy()[: pipeline.counts.pairs[kind].queued]
             found[kind.label] = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
         return Candidates(**found)

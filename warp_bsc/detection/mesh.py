@@ -12,7 +12,7 @@ from .._arguments import as_numpy, checked_bits, checked_distances, checked_flag
 from .._sorted_keys import expand_ranges
 from ..kernels.pairs import PairFilter
 from .face_order import order_faces
-from .run.settings import DistanceKind, PairKind
+from .run.settings import PairKind
 from .run.start import checked_device
 
 _MOST_LISTED = 31
@@ -278,11 +278,11 @@ class CollisionMesh:
         """Vertex indices of the tetrahedra on the device, two-dimensional Warp array of int."""
         return wp.array(self.tets, dtype=int, device=self.device)
 
-    def elements(self, kind: PairKind | DistanceKind) -> np.ndarray:
+    def elements(self, kind: PairKind) -> np.ndarray:
         """Returns the faces for pairs of a vertex and a face, else the edges."""
         return self.faces if kind == PairKind.VERTEX_FACE else self.edges
 
-    def device_elements(self, kind: PairKind | DistanceKind) -> wp.array:
+    def device_elements(self, kind: PairKind) -> wp.array:
         """Returns the vertex indices of the second elements of a kind of pair, two-dimensional Warp array of int.
 
         Those of two points are not used, and are the edges here.

@@ -22,7 +22,6 @@ from .run.settings import (
     TOLERANCE,
     Counters,
     Counts,
-    DistanceKind,
     Method,
     PairCounts,
     PairKind,
@@ -218,9 +217,9 @@ class DetectionPipeline:
         self.points: tuple[NarrowPhase, ...] = ()
         if self.radius is not None and len(mesh.points):
             self.points = (
-                NarrowPhase(DistanceKind.VERTEX_EDGE, self.counters.vertex_edge, edge_edge, elements=(vertices, edges)),
+                NarrowPhase(PairKind.VERTEX_EDGE, self.counters.vertex_edge, edge_edge, elements=(vertices, edges)),
                 NarrowPhase(
-                    DistanceKind.VERTEX_VERTEX, self.counters.vertex_vertex, edge_edge, elements=(vertices, vertices)
+                    PairKind.VERTEX_VERTEX, self.counters.vertex_vertex, edge_edge, elements=(vertices, vertices)
                 ),
             )
         self.update_capacities()
@@ -377,7 +376,7 @@ class DetectionPipeline:
                 self._retired += narrow_phase.buffers
         self.broad_phase.grow(counts.face_pairs)
         for narrow_phase in self.narrow_phases:
-            narrow_phase.grow(counts.pairs[DistanceKind(narrow_phase.kind)])
+            narrow_phase.grow(counts.pairs[narrow_phase.kind])
         self.update_capacities()
         return True
 

@@ -13,7 +13,7 @@ import numpy as np
 import orjson
 
 from .._version import __version__
-from ..detection.run.settings import DistanceKind, PairKind
+from ..detection.run.settings import SURFACE_KINDS, PairKind
 from ..usd.scene import Scene
 from .hit_records import head_line, interval_line, kind_words, phase_words, tail_line
 from .limit import not_listed
@@ -98,7 +98,7 @@ class HitsJson(RecordFile):
         self._numbers = {name: number for number, name in enumerate(facts["meshes"])}
         self._earlier_count = earlier_count
         self._saved_at = -math.inf
-        self._kinds = [kind.label for kind in DistanceKind if has_strands or kind in tuple(PairKind)]
+        self._kinds = [kind.label for kind in PairKind if has_strands or kind in SURFACE_KINDS]
 
     def add(self, result: IntervalResult) -> None:
         """Appends an interval; saves the file at the first one, and then every 20 seconds."""

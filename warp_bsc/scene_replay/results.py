@@ -7,7 +7,7 @@ import numpy as np
 
 from ..detection.inversions import Inversions
 from ..detection.results.collisions import DetectionStats, PhaseCounts
-from ..detection.run.settings import DistanceKind
+from ..detection.run.settings import PairKind
 from ..usd.interval import Interval
 from .scene_contacts import SceneContacts
 from .scene_intersections import SceneIntersections
@@ -196,7 +196,7 @@ class IntervalSummary:
 
     @property
     def _phases(self) -> list[PhaseCounts]:
-        return [getattr(self.stats, kind.label) for kind in DistanceKind]
+        return [getattr(self.stats, kind.label) for kind in PairKind]
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from dataclasses import asdict
 from typing import Any
 
 from ..detection.results.collisions import DetectionStats, PhaseCounts
-from ..detection.run.settings import DistanceKind
+from ..detection.run.settings import PairKind
 from ..usd.interval import Interval
 from .results import Contact, IntersectionSummary, IntervalSummary, InvertedTetrahedra, Nearest, ProximitySummary
 from .scene_pairs import PHASES
@@ -98,7 +98,7 @@ def read_summary(fields: dict[str, Any], interval: Interval, names: list[str]) -
         names: Names of the meshes in the file.
     """
     # a scene without curves and points has no counts of their pairs
-    labels = [kind.label for kind in DistanceKind]
+    labels = [kind.label for kind in PairKind]
     counts = {label: PhaseCounts(**fields["stages"].get(label, {})) for label in labels}
     validation = fields["validation"]
     if validation:

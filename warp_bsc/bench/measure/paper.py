@@ -18,7 +18,7 @@ import warp as wp
 
 from ... import checker
 from ...detection.run.launch import cores
-from ...detection.run.settings import PairKind
+from ...detection.run.settings import SURFACE_KINDS, PairKind
 from ...kernels.signs import UNSURE
 from ..peers import ipc_toolkit
 from ..peers.ipc_toolkit import CCD_CLASSES, decide_queries, time_queries
@@ -193,7 +193,7 @@ def gather_queries(
     """Returns the overlapping pairs of some intervals by kind, or a random part of them; and their number."""
     random = np.random.default_rng(SEED)
     x0, x1 = (np.concatenate([getattr(scene, end) for _, scene in intervals]) for end in ("x0", "x1"))
-    elements, pairs = ({kind: [] for kind in PairKind} for _ in range(2))
+    elements, pairs = ({kind: [] for kind in SURFACE_KINDS} for _ in range(2))
     vertices = overlapping = 0
     for _, scene in intervals:
         found = find_overlapping(scene, device)
@@ -211,7 +211,7 @@ def gather_queries(
             elements[kind].append(kind_elements + vertices)
         vertices += len(scene.x0)
     queries = {
-        kind: Queries(kind, x0, x1, np.concatenate(elements[kind]), np.concatenate(pairs[kind])) for kind in PairKind
+        kind: Queries(kind, x0, x1, np.concatenate(elements[kind]), np.concatenate(pairs[kind])) for kind in elements
     }
     return {kind: found for kind, found in queries.items() if len(found)}, overlapping
 
@@ -287,7 +287,7 @@ def find_adversarial_worst(places: list[Place], effort: Effort) -> list[dict[str
     found = []
     for place in places:
         if place.cores in (1, None):
-            queries = [adversarial_queries(kind, effort.adversaries) for kind in PairKind]
+            queries = [adversarial_queries(kind, effort.adversaries) for kind in SURFACE_KINDS]
             with place.limited():
                 found.append({"place": place.name, "worst": _find_slowest(queries, place, effort)})
     return found

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from ...detection.run.settings import PairKind
+from ...detection.run.settings import SURFACE_KINDS
 from ..tables import Column, Table, count
 from .detector import phase_columns
 from .methods import METHODS, PHASES
@@ -71,7 +71,7 @@ _SLOWEST = _method_columns(  # of the slowest query of each method
     lambda worst, method: worst[method]["nanoseconds"][method], _few_digits, {"cubic": "cubic /\nfloat"}
 )
 _SLOWEST_OF_ALL = (
-    Column("Kind", lambda query: next(kind.display_name for kind in PairKind if kind.label == query["kind"])),
+    Column("Kind", lambda query: next(kind.display_name for kind in SURFACE_KINDS if kind.label == query["kind"])),
     Column("Number", "number", ""),
     *_method_columns(lambda query, method: query["nanoseconds"][method], _few_digits),
 )

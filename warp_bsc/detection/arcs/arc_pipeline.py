@@ -12,7 +12,7 @@ from ..narrow.rules.arc import allocate_arcs, bound_arc
 from ..pipeline import DetectionPipeline
 from ..results.collision_finder import CollisionFinder
 from ..run.launch import launch, made_once
-from ..run.settings import NO_FUSED_OPERATIONS, DistanceKind
+from ..run.settings import NO_FUSED_OPERATIONS, PairKind
 from .rigid_motion import ArcBounds
 
 LARGEST_TURN = 0.5 * np.pi
@@ -61,7 +61,7 @@ class ArcPipeline:
         """Returns whether one pass decides a motion in less time than parts of the step."""
         return bool((np.linalg.norm(bounds.motion.turn, axis=1) <= LARGEST_TURN).all())
 
-    def has_unsure_pairs(self, contacts: dict[DistanceKind, ContactRows]) -> bool:
+    def has_unsure_pairs(self, contacts: dict[PairKind, ContactRows]) -> bool:
         """Returns whether the last run reports a pair on arcs that took too many parts of the step to decide.
 
         It may be farther from a collision than the tolerance.
@@ -83,7 +83,7 @@ class ArcPipeline:
         self._arcs.turn.assign(bounds.motion.turn)
         self._arcs.tolerance = bounds.tolerance
 
-    def certifies(self, contacts: dict[DistanceKind, ContactRows]) -> bool:
+    def certifies(self, contacts: dict[PairKind, ContactRows]) -> bool:
         """Returns whether the last run of a CUDA graph proves its result, by its bodies and, if exact, its pairs.
 
         All bodies within which pairs are left out must have been rigid.

@@ -19,7 +19,7 @@ from ..narrow.on_host import pair_distances
 from ..pipeline import DetectionPipeline
 from ..run.launch import retry_until_fits
 from ..run.phase_timer import PhaseTimer
-from ..run.settings import Counts, DistanceKind, add_counts
+from ..run.settings import Counts, PairKind, add_counts
 from .rigid_motion import ArcBounds
 
 _COARSE = 0.25
@@ -73,11 +73,11 @@ class ArcSearch:
             body=body,
             only_used_vertices=True,
         )
-        self._elements = {DistanceKind(n.kind): mesh.elements(n.kind) for n in self._pipeline.narrow_phases}
+        self._elements = {n.kind: mesh.elements(n.kind) for n in self._pipeline.narrow_phases}
 
     def find(
         self, bounds: ArcBounds, x0: wp.array, changed: wp.array | None, timer: PhaseTimer
-    ) -> tuple[dict[DistanceKind, HostContacts], Counts]:
+    ) -> tuple[dict[PairKind, HostContacts], Counts]:
         """Returns the contacts of each kind of pair, the first of each pair, and the counts of all parts together.
 
         Args:
@@ -90,7 +90,7 @@ class ArcSearch:
         self._pipeline.set_bodies(bounds.body)
         self._deviations: dict[int, np.ndarray] = {}
         self._counts: Counts | None = None
-        self._found: dict[DistanceKind, list[HostContacts]] = {kind: [] for kind in self._elements}
+        self._found: dict[PairKind, list[HostContacts]] = {kind: [] for kind in self._elements}
         self._keys = {kind: np.zeros(0, dtype=np.int64) for kind in self._elements}
         level = self._first_level(x0)
         for part in range(2**level):
@@ -133,7 +133,7 @@ class ArcSearch:
             for half in range(2):
                 self._search(level + 1, 2 * part + half, vertices)
 
-    def _detect(self, level: int, part: int, changed: wp.array | None) -> dict[DistanceKind, HostContacts]:
+    def _detect(self, level: int, part: int, changed: wp.array | None) -> dict[PairKind, HostContacts]:
         """Returns the pairs whose chords come within their deviations in a part of the step, of each kind."""
         pipeline, timer = self._pipeline, self._timer
         pipeline.add_to_radius(self._deviation(level))
@@ -147,9 +147,7 @@ class ArcSearch:
         self._counts = counts if self._counts is None else add_counts(self._counts, counts)
         with timer.phase("sort"):
             return {
-                DistanceKind(phase.kind): read_contacts(
-                    phase.contacts, int(pipeline.counts.pairs[DistanceKind(phase.kind)].contacts)
-                )
+                phase.kind: read_contacts(phase.contacts, int(pipeline.counts.pairs[phase.kind].contacts))
                 for phase in pipeline.narrow_phases
             }
 

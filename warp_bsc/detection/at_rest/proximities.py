@@ -20,7 +20,7 @@ from ..narrow.on_host import pair_distances
 from ..narrow.rings import Rings, are_within_rings, make_rings
 from ..queries.query_points import mesh_of_rows
 from ..run.launch import launch_over_queue, made_once, retry_until_fits
-from ..run.settings import NO_GRADIENTS, Count, Counters, DistanceKind, PairCounts, capacity_for
+from ..run.settings import NO_GRADIENTS, Count, Counters, PairCounts, PairKind, capacity_for
 from ..run.start import checked_device
 
 _FOUND = wp.constant(int(Count.FOUND))
@@ -125,7 +125,7 @@ class Proximities:
 class _ProximityQueue:
     """The queue of candidates of one kind, and the proximities among them."""
 
-    def __init__(self, kind: DistanceKind, counts: wp.array, capacity: int, device: wp.Device):
+    def __init__(self, kind: PairKind, counts: wp.array, capacity: int, device: wp.Device):
         self.kind, self.counts, self._device = kind, counts, device
         self.candidates = wp.empty(capacity, dtype=wp.vec2i, device=device)
         self._allocate(capacity)
@@ -181,8 +181,7 @@ class ProximityFinder:
         self._lock = self._broad_phase.lock
         elements = len(mesh.faces) + len(mesh.free_edges) + len(mesh.points)
         self._queues = [
-            _ProximityQueue(kind, getattr(self._counters, kind.label), 2 * elements, mesh.device)
-            for kind in DistanceKind
+            _ProximityQueue(kind, getattr(self._counters, kind.label), 2 * elements, mesh.device) for kind in PairKind
         ]
         self._rings = make_rings(mesh, rings)
 
@@ -313,8 +312,8 @@ def distances(points: ArrayLike | wp.array, kind: str, *, device: wp.DeviceLike 
         ValueError: If the points have another shape or type, are not finite, more than 2^1000 or 2^29 rows or more, or
             the kind or the device is unknown.
     """
-    name = checked_choice(kind, "kind", [kind.label for kind in DistanceKind])
-    of_kind = DistanceKind[name.upper()]
+    name = checked_choice(kind, "kind", [kind.label for kind in PairKind])
+    of_kind = PairKind[name.upper()]
     if isinstance(points, wp.array):
         device = points.device if device is None else device
     points = checked_coordinates(points, (of_kind.points, 3), "points")

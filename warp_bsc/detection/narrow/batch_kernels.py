@@ -21,7 +21,7 @@ from ...kernels.polynomials import coplanarity
 from ...kernels.signs import FREE, UNSURE
 from ...kernels.time_of_impact import clamped_tolerance, impact, power_of_two
 from ..run.launch import made_once
-from ..run.settings import NO_FUSED_OPERATIONS, Count, DistanceKind, PairKind
+from ..run.settings import NO_FUSED_OPERATIONS, Count, PairKind
 from .pair_kernels import PairBuffers, write_decision, write_impact
 
 _QUEUED = wp.constant(int(Count.QUEUED))
@@ -51,7 +51,7 @@ def _move_turning_pairs(kind: int, buffers: PairBuffers, arcs: Arcs, first: int,
 
 
 @made_once
-def batch_culling_kernel(kind: PairKind | DistanceKind, dtype: type, on_arcs: bool) -> wp.Kernel:
+def batch_culling_kernel(kind: PairKind, dtype: type, on_arcs: bool) -> wp.Kernel:
     """Returns the kernel that culls on the CPU, in batches, for one kind of pair and one type of position.
 
     If a vertex turns, each batch of the queue then begins with the pairs on arcs that remain, for :mod:`.arc`,
@@ -105,7 +105,7 @@ def batch_culling_kernel(kind: PairKind | DistanceKind, dtype: type, on_arcs: bo
 
 
 @made_once
-def batch_classification_kernel(kind: PairKind | DistanceKind, dtype: type) -> wp.Kernel:
+def batch_classification_kernel(kind: PairKind, dtype: type) -> wp.Kernel:
     """Returns the kernel that classifies survivors on the CPU, in batches, for one kind and one type of position."""
     kind_number = int(kind)
     classify_batch = classify_batch_of(dtype, kind == PairKind.VERTEX_FACE)
@@ -173,7 +173,7 @@ def _decide_batch(first: int, count: int, timed: bool, buffers: PairBuffers):
 
 
 @made_once
-def batch_impact_kernel(kind: PairKind | DistanceKind, dtype: type) -> wp.Kernel:
+def batch_impact_kernel(kind: PairKind, dtype: type) -> wp.Kernel:
     """Returns the kernel that finds times of impact on the CPU, in batches, for one kind and one type of position."""
     kind_number = int(kind)
     impact_batch = impact_batch_of(dtype, kind == PairKind.VERTEX_FACE)

@@ -26,7 +26,7 @@ from ...kernels.pipeline.queues import take_slot
 from ...kernels.signs import FREE, HIT, UNSURE
 from ...kernels.time_of_impact import MIN_DIGITS
 from ..run.launch import launch_over_queue, made_once
-from ..run.settings import NO_FUSED_OPERATIONS, Count, DistanceKind, PairKind
+from ..run.settings import NO_FUSED_OPERATIONS, Count, PairKind
 from .contact_buffer import make_contact_buffer
 from .pair_kernels import PairBuffers
 
@@ -139,7 +139,7 @@ def _distance_kernel(dtype: type, limbs: int) -> wp.Kernel:
 
 
 def are_within_distance(
-    kind: DistanceKind, x: wp.array, elements: wp.array, pairs: np.ndarray, distance: float
+    kind: PairKind, x: wp.array, elements: wp.array, pairs: np.ndarray, distance: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns which pairs at rest are within a distance, and which pairs are decided; bool, each of shape [n].
 
@@ -171,7 +171,7 @@ def launch_exact_distances(
     x0: wp.array,
     x1: wp.array,
     radius: wp.array,
-    kind: DistanceKind,
+    kind: PairKind,
     *,
     timed: bool,
     tolerance: float,
@@ -196,7 +196,7 @@ def launch_exact_distances(
 
 
 def launch_exact_phase(
-    kind: PairKind | DistanceKind,
+    kind: PairKind,
     x0: wp.array,
     x1: wp.array,
     *,

@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from ..run.launch import launch_over, launch_over_queue, max_blocks
-from ..run.settings import UNLIMITED, Count, DistanceKind, PairCounts, PairKind, capacity_for
+from ..run.settings import UNLIMITED, Count, PairCounts, PairKind, capacity_for
 from .contact_buffer import ContactBuffer, make_contact_buffer
 from .exact_phase import launch_exact_phase
 from .pair_kernels import PairBuffers, PairRule, cull_kernel, decide_kernel, gather_contacts, pad_keys
@@ -28,9 +28,7 @@ class NarrowPhase:
         contacts: The contacts in no order; ``counts[Count.CONTACTS]`` rows are filled. Some have turned out to be free.
     """
 
-    def __init__(
-        self, kind: PairKind | DistanceKind, counts: wp.array, capacity: int, elements: Sequence[int] | np.ndarray
-    ):
+    def __init__(self, kind: PairKind, counts: wp.array, capacity: int, elements: Sequence[int] | np.ndarray):
         """Allocates the buffers.
 
         Args:
@@ -148,13 +146,13 @@ Phases = Sequence[tuple[NarrowPhase, wp.array]]
 """Narrow phases of different kinds, each with the vertex indices of its second elements."""
 
 
-def buffers_of(phases: Phases) -> dict[PairKind | DistanceKind, PairBuffers]:
+def buffers_of(phases: Phases) -> dict[PairKind, PairBuffers]:
     """Returns the buffers of narrow phases by kind, as arguments of kernels."""
     return {phase.kind: phase.pair_buffers(elements) for phase, elements in phases}
 
 
 def launch_culls(
-    rule: PairRule, buffers: Mapping[PairKind | DistanceKind, PairBuffers], x0: wp.array, x1: wp.array, options: Any
+    rule: PairRule, buffers: Mapping[PairKind, PairBuffers], x0: wp.array, x1: wp.array, options: Any
 ) -> None:
     """Launches a rule from the queue of each kind to its survivors, from both positions and the rule's options."""
     for kind, s in buffers.items():
@@ -164,7 +162,7 @@ def launch_culls(
 
 
 def launch_decisions(
-    rule: PairRule, buffers: Mapping[PairKind | DistanceKind, PairBuffers], x0: wp.array, x1: wp.array, options: Any
+    rule: PairRule, buffers: Mapping[PairKind, PairBuffers], x0: wp.array, x1: wp.array, options: Any
 ) -> None:
     """Launches a rule from the survivors of all kinds to their contacts, as :func:`launch_culls`."""
     kernel, inputs = decide_kernel(rule, x0.dtype), [x0, x1, options]
@@ -173,7 +171,7 @@ def launch_decisions(
 
 def launch_over_kinds(
     kernel: wp.Kernel,
-    buffers: Mapping[PairKind | DistanceKind, PairBuffers],
+    buffers: Mapping[PairKind, PairBuffers],
     buffer: str,
     count: Count,
     *,

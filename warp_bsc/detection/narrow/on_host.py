@@ -10,7 +10,7 @@ from ...kernels.motion import relative_motion
 from ...kernels.pairs import ends_of, points_of_pair
 from ...kernels.signs import FREE, HIT
 from ..run.launch import launch, made_once
-from ..run.settings import NO_FUSED_OPERATIONS, DistanceKind
+from ..run.settings import NO_FUSED_OPERATIONS, PairKind
 from .contact_buffer import HostContacts
 
 
@@ -47,7 +47,7 @@ def _kernel(dtype: type, with_distance: bool) -> wp.Kernel:
 
 
 def pair_distances(
-    kind: DistanceKind, elements: np.ndarray, pairs: np.ndarray, radius: np.ndarray
+    kind: PairKind, elements: np.ndarray, pairs: np.ndarray, radius: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns the vertices of pairs of a kind, int, shape [n, kind.points], and their minimum distances, shape [n].
 
@@ -57,14 +57,14 @@ def pair_distances(
         pairs: (vertex, face) and so on, shape [n, 2].
         radius: Radius of each vertex, float64.
     """
-    first = elements[pairs[:, 0]] if kind == DistanceKind.EDGE_EDGE else pairs[:, :1]
-    second = pairs[:, 1:] if kind == DistanceKind.VERTEX_VERTEX else elements[pairs[:, 1]]
+    first = elements[pairs[:, 0]] if kind == PairKind.EDGE_EDGE else pairs[:, :1]
+    second = pairs[:, 1:] if kind == PairKind.VERTEX_VERTEX else elements[pairs[:, 1]]
     distance = radius[first].max(axis=1, initial=0.0) + radius[second].max(axis=1, initial=0.0)
     return np.concatenate([first, second], axis=1), distance
 
 
 def decide_on_host(
-    kind: DistanceKind,
+    kind: PairKind,
     x0: wp.array,
     x1: wp.array,
     elements: wp.array,

@@ -17,7 +17,7 @@ from ..narrow.rules.contact import run_contacts
 from ..narrow.rules.distance import run_distances
 from ..run.launch import retry_until_fits
 from ..run.phase_timer import PhaseTimer
-from ..run.settings import METHODS, TOLERANCE, Count, DistanceKind, Method, PairCounts, PairKind, checked_tolerance
+from ..run.settings import METHODS, SURFACE_KINDS, TOLERANCE, Count, Method, PairCounts, PairKind, checked_tolerance
 from ..run.start import checked_device
 from .query_arrays import DeviceQueryResult, query_into
 from .query_points import mesh_of_rows
@@ -106,7 +106,7 @@ def query_vertex_face(
     """
     if out is not None:
         return _query_into(out, PairKind.VERTEX_FACE, points, min_distance, method, toi, tolerance, device)
-    return _query(DistanceKind.VERTEX_FACE, points, min_distance, method, toi, tolerance, device)
+    return _query(PairKind.VERTEX_FACE, points, min_distance, method, toi, tolerance, device)
 
 
 @overload
@@ -146,7 +146,7 @@ def query_edge_edge(
     """
     if out is not None:
         return _query_into(out, PairKind.EDGE_EDGE, points, min_distance, method, toi, tolerance, device)
-    return _query(DistanceKind.EDGE_EDGE, points, min_distance, method, toi, tolerance, device)
+    return _query(PairKind.EDGE_EDGE, points, min_distance, method, toi, tolerance, device)
 
 
 def query_vertex_edge(
@@ -163,7 +163,7 @@ def query_vertex_edge(
     The points have shape [n, 6, 3], rows p0 a0 b0 p1 a1 b1: vertex p and edge a b at the start (0) and at the end (1)
     of the step. Other arguments, result and errors are those of :func:`query_vertex_face`.
     """
-    return _query(DistanceKind.VERTEX_EDGE, points, min_distance, method, toi, tolerance, device)
+    return _query(PairKind.VERTEX_EDGE, points, min_distance, method, toi, tolerance, device)
 
 
 def query_vertex_vertex(
@@ -180,7 +180,7 @@ def query_vertex_vertex(
     The points have shape [n, 4, 3], rows p0 q0 p1 q1: vertices p and q at the start (0) and at the end (1) of the step.
     Other arguments, result and errors are those of :func:`query_vertex_face`.
     """
-    return _query(DistanceKind.VERTEX_VERTEX, points, min_distance, method, toi, tolerance, device)
+    return _query(PairKind.VERTEX_VERTEX, points, min_distance, method, toi, tolerance, device)
 
 
 def _query_into(
@@ -209,7 +209,7 @@ def _query_into(
 
 
 def _query(
-    kind: DistanceKind,
+    kind: PairKind,
     points: ArrayLike | wp.array,
     min_distance: ArrayLike,
     method: Method,
@@ -238,10 +238,10 @@ def _query(
     narrow_phase.queue.assign(pairs)
     all_queued = PairCounts(queued=n)
     # without a distance: the narrow phase of contacts
-    contact = kind in (DistanceKind.VERTEX_FACE, DistanceKind.EDGE_EDGE) and not distance.any()
+    contact = kind in SURFACE_KINDS and not distance.any()
     radius = np.zeros((n, half))
     radius[:, 0] = distance  # those of the other vertices are 0, so that the sum of two is exact
-    if kind == DistanceKind.EDGE_EDGE:
+    if kind == PairKind.EDGE_EDGE:
         radius[:, 1] = distance
     radius = radius.ravel()
     device_radius = wp.array(radius, dtype=wp.float64, device=device)
@@ -269,7 +269,7 @@ def _query(
             if method == "exact":
                 left |= contacts.decided == UNSURE
             decide_on_host(kind, x0, x1, elements, None if contact else radius, contacts, left, timed=timed)
-        return contacts, contacts.pairs[:, 0] // (2 if kind == DistanceKind.EDGE_EDGE else half)
+        return contacts, contacts.pairs[:, 0] // (2 if kind == PairKind.EDGE_EDGE else half)
 
     certified, certified_rows = solve("conservative" if method == "float" else method)
     status = np.zeros(n, dtype=np.int8)

@@ -5,7 +5,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from ..._arguments import as_numpy, checked_choice, checked_shape
-from ..run.settings import DistanceKind, PairKind
+from ..run.settings import PairKind
 
 _CORNERS = {"vertex_face": (1, 3), "edge_edge": (2, 2), "vertex_edge": (1, 2), "vertex_vertex": (1, 1)}
 """Number of vertices of both elements, by kind of pair."""
@@ -74,7 +74,7 @@ def query_points(
     return np.concatenate([x0[corners], x1[corners]], axis=1)
 
 
-def mesh_of_rows(kind: DistanceKind, points: np.ndarray, device: wp.Device) -> tuple[wp.array, wp.array, np.ndarray]:
+def mesh_of_rows(kind: PairKind, points: np.ndarray, device: wp.Device) -> tuple[wp.array, wp.array, np.ndarray]:
     """Returns a mesh in which each pair has vertices of its own: positions, second elements, and the pairs.
 
     Args:
@@ -88,16 +88,16 @@ def mesh_of_rows(kind: DistanceKind, points: np.ndarray, device: wp.Device) -> t
     return x, wp.array(elements, dtype=int, device=device), pairs
 
 
-def elements_of_rows(kind: DistanceKind | PairKind, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def elements_of_rows(kind: PairKind, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns the second elements of pairs that have vertices of their own, and the pairs, each from a row of vertices.
 
     The elements of two edges are those of all first and second edges. All are int32, as the vertices, C-contiguous.
     """
     rows = np.arange(len(vertices), dtype=np.int32)
-    if kind == DistanceKind.EDGE_EDGE:
+    if kind == PairKind.EDGE_EDGE:
         return vertices.reshape(-1, 2), np.stack([2 * rows, 2 * rows + 1], axis=1)
     elements = np.ascontiguousarray(vertices[:, 1:])
-    return elements, vertices if kind == DistanceKind.VERTEX_VERTEX else np.stack([vertices[:, 0], rows], axis=1)
+    return elements, vertices if kind == PairKind.VERTEX_VERTEX else np.stack([vertices[:, 0], rows], axis=1)
 
 
 def _check_detected(pairs: np.ndarray, first: np.ndarray, second: np.ndarray) -> None:

@@ -12,7 +12,7 @@ from ..narrow.on_host import decide_on_host
 from ..pipeline import DetectionPipeline
 from ..run.launch import retry_until_fits
 from ..run.phase_timer import PhaseTimer
-from ..run.settings import Counts, DistanceKind
+from ..run.settings import Counts, PairKind
 from .collisions import CapturedCollisions, Collisions
 from .differentiable import DifferentiableContacts
 
@@ -58,7 +58,7 @@ class CollisionFinder:
         return Collisions(pipeline.method != "float", (), arrays, pipeline.method, counts, contacts, timer)
 
     def capture(
-        self, x0: wp.array, x1: wp.array, certifies: Callable[[dict[DistanceKind, ContactRows]], bool] = lambda _: True
+        self, x0: wp.array, x1: wp.array, certifies: Callable[[dict[PairKind, ContactRows]], bool] = lambda _: True
     ) -> CapturedCollisions:
         """Adds a detection to the graph that a GPU captures.
 
@@ -98,7 +98,7 @@ class CollisionFinder:
             for narrow_phase in pipeline.narrow_phases:
                 capacity = len(narrow_phase.contacts.pairs)
                 buffer = make_contact_buffer(capacity, self._device)
-                whole[DistanceKind(narrow_phase.kind)] = narrow_phase.ordered_contacts(capacity, buffer)
+                whole[narrow_phase.kind] = narrow_phase.ordered_contacts(capacity, buffer)
             arrays = self._differentiable(x0, x1, whole)
         return CapturedCollisions(arrays, read_alone)
 
@@ -108,7 +108,7 @@ class CollisionFinder:
             for name, x in (("x0", x0), ("x1", x1)):
                 check_finite(x.numpy(), name, self.pipeline.mesh.vertices)
 
-    def _ordered_contacts(self, counts: Counts, *, recycle: bool) -> dict[DistanceKind, ContactRows]:
+    def _ordered_contacts(self, counts: Counts, *, recycle: bool) -> dict[PairKind, ContactRows]:
         """Returns the sorted contacts of each kind of pair, without those that overflowed.
 
         Args:
@@ -118,14 +118,14 @@ class CollisionFinder:
         """
         contacts, device = {}, self._device
         for narrow_phase in self.pipeline.narrow_phases:
-            kind = DistanceKind(narrow_phase.kind)
+            kind = narrow_phase.kind
             count = min(counts.pairs[kind].collisions, len(narrow_phase.contacts.pairs))
             rows = self._buffers.acquire(count) if recycle else ContactRows(make_contact_buffer(count, device), count)
             narrow_phase.ordered_contacts(count, rows.buffer)
             contacts[kind] = rows
         return contacts
 
-    def _decide_on_host(self, kind: DistanceKind, rows: ContactRows, x0: wp.array, x1: wp.array) -> ContactRows:
+    def _decide_on_host(self, kind: PairKind, rows: ContactRows, x0: wp.array, x1: wp.array) -> ContactRows:
         """Returns the contacts without those that the host refutes; the others get its times and points."""
         contacts = rows.read()
         which = (contacts.decided == UNSURE) | ~contacts.within_tolerance

@@ -10,7 +10,7 @@ import warp as wp
 
 from ..narrow.contact_buffer import ContactRows, HostContacts, empty_contacts
 from ..run.phase_timer import PhaseTimer, PhaseTimers
-from ..run.settings import Counts, DistanceKind, Method, PairCounts
+from ..run.settings import Counts, Method, PairCounts, PairKind
 from .differentiable import DifferentiableContacts
 
 
@@ -113,13 +113,13 @@ class DetectionStats:
     @property
     def filtered(self) -> int:
         """Number of pairs of all kinds that groups and masks of the mesh leave out, see :class:`PhaseCounts`."""
-        return sum(getattr(self, kind.label).filtered for kind in DistanceKind)
+        return sum(getattr(self, kind.label).filtered for kind in PairKind)
 
 
 def add_stats(first: DetectionStats, second: DetectionStats) -> DetectionStats:
     """Returns the counts and times of two detections together."""
     buffers = {}
-    for kind in DistanceKind:
+    for kind in PairKind:
         one, other = asdict(getattr(first, kind.label)), asdict(getattr(second, kind.label))
         buffers[kind.label] = PhaseCounts(**{name: one[name] + other[name] for name in one})
     milliseconds = Counter(first.milliseconds)
@@ -152,9 +152,9 @@ class Collisions:
     arrays: DifferentiableContacts | None
     _method: Method = field(repr=False)
     _counts: Counts = field(repr=False)
-    _rows: dict[DistanceKind, ContactRows] = field(repr=False)
+    _rows: dict[PairKind, ContactRows] = field(repr=False)
     _timer: PhaseTimer | PhaseTimers = field(repr=False)
-    _read: dict[DistanceKind, HostContacts] = field(default_factory=dict, init=False, repr=False)
+    _read: dict[PairKind, HostContacts] = field(default_factory=dict, init=False, repr=False)
 
     def __len__(self) -> int:
         """Returns the number of pairs of all kinds."""
@@ -171,7 +171,7 @@ class Collisions:
         """Whether the motion is certified to be free of collisions."""
         return self.certified and not len(self)
 
-    def _contacts(self, kind: DistanceKind) -> HostContacts:
+    def _contacts(self, kind: PairKind) -> HostContacts:
         """Returns the contacts of a kind of pair, read once; only meshes with points have those of points."""
         if kind not in self._read:
             self._read[kind] = self._rows[kind].read() if kind in self._rows else empty_contacts()
@@ -180,12 +180,12 @@ class Collisions:
     @property
     def vertex_face(self) -> np.ndarray:
         """(vertex, face), int32, shape [n, 2]."""
-        return self._contacts(DistanceKind.VERTEX_FACE).pairs
+        return self._contacts(PairKind.VERTEX_FACE).pairs
 
     @property
     def edge_edge(self) -> np.ndarray:
         """(edge, edge), the smaller first, as in ``mesh.edges``, int32, shape [m, 2]."""
-        return self._contacts(DistanceKind.EDGE_EDGE).pairs
+        return self._contacts(PairKind.EDGE_EDGE).pairs
 
     @property
     def vertex_face_toi(self) -> np.ndarray:
@@ -193,22 +193,22 @@ class Collisions:
 
         They are at most the tolerance before the first contact, except for UNSURE pairs of "float" and "conservative".
         """
-        return self._contacts(DistanceKind.VERTEX_FACE).toi
+        return self._contacts(PairKind.VERTEX_FACE).toi
 
     @property
     def edge_edge_toi(self) -> np.ndarray:
         """Times of impact of the edges, as :attr:`vertex_face_toi`, float64, shape [m]."""
-        return self._contacts(DistanceKind.EDGE_EDGE).toi
+        return self._contacts(PairKind.EDGE_EDGE).toi
 
     @property
     def vertex_face_coordinates(self) -> np.ndarray:
         """Barycentric coordinates of the contact in the face, float64, shape [n, 3]."""
-        return self._contacts(DistanceKind.VERTEX_FACE).coordinates
+        return self._contacts(PairKind.VERTEX_FACE).coordinates
 
     @property
     def edge_edge_coordinates(self) -> np.ndarray:
         """(s, r, 0) along the two edges, float64, shape [m, 3]."""
-        return self._contacts(DistanceKind.EDGE_EDGE).coordinates
+        return self._contacts(PairKind.EDGE_EDGE).coordinates
 
     @property
     def vertex_face_normal(self) -> np.ndarray:
@@ -220,7 +220,7 @@ class Collisions:
         opposite to the velocity, and (0, 0, 1) where there is none.
         With a minimum distance those of all pairs are along the closest points, from the second element to the first.
         """
-        return self._contacts(DistanceKind.VERTEX_FACE).normal
+        return self._contacts(PairKind.VERTEX_FACE).normal
 
     @property
     def edge_edge_normal(self) -> np.ndarray:
@@ -230,7 +230,7 @@ class Collisions:
         :attr:`vertex_face_normal`: perpendicular to that velocity for edges that move in their plane, opposite to it
         for edges that are parallel.
         """
-        return self._contacts(DistanceKind.EDGE_EDGE).normal
+        return self._contacts(PairKind.EDGE_EDGE).normal
 
     @property
     def vertex_edge(self) -> np.ndarray:
@@ -238,37 +238,37 @@ class Collisions:
 
         With a minimum distance only, as :attr:`vertex_vertex`: pairs of points with faces are in :attr:`vertex_face`.
         """
-        return self._contacts(DistanceKind.VERTEX_EDGE).pairs
+        return self._contacts(PairKind.VERTEX_EDGE).pairs
 
     @property
     def vertex_vertex(self) -> np.ndarray:
         """(point, point), the smaller first, int32, shape [l, 2]."""
-        return self._contacts(DistanceKind.VERTEX_VERTEX).pairs
+        return self._contacts(PairKind.VERTEX_VERTEX).pairs
 
     @property
     def vertex_edge_toi(self) -> np.ndarray:
         """Times of impact of points with edges, as :attr:`vertex_face_toi`, float64, shape [k]."""
-        return self._contacts(DistanceKind.VERTEX_EDGE).toi
+        return self._contacts(PairKind.VERTEX_EDGE).toi
 
     @property
     def vertex_vertex_toi(self) -> np.ndarray:
         """Times of impact of points with points, as :attr:`vertex_face_toi`, float64, shape [l]."""
-        return self._contacts(DistanceKind.VERTEX_VERTEX).toi
+        return self._contacts(PairKind.VERTEX_VERTEX).toi
 
     @property
     def vertex_edge_coordinates(self) -> np.ndarray:
         """(s, 0, 0) along the edge, float64, shape [k, 3]."""
-        return self._contacts(DistanceKind.VERTEX_EDGE).coordinates
+        return self._contacts(PairKind.VERTEX_EDGE).coordinates
 
     @property
     def vertex_edge_normal(self) -> np.ndarray:
         """Unit normals from the edge to the point, float64, shape [k, 3]."""
-        return self._contacts(DistanceKind.VERTEX_EDGE).normal
+        return self._contacts(PairKind.VERTEX_EDGE).normal
 
     @property
     def vertex_vertex_normal(self) -> np.ndarray:
         """Unit normals from the second point to the first, float64, shape [l, 3]."""
-        return self._contacts(DistanceKind.VERTEX_VERTEX).normal
+        return self._contacts(PairKind.VERTEX_VERTEX).normal
 
     @functools.cached_property
     def earliest_toi(self) -> float:

@@ -13,7 +13,7 @@ from ...kernels.time_of_impact import Impact
 from ..mesh import CollisionMesh
 from ..narrow.contact_buffer import ContactBuffer
 from ..run.launch import launch, made_once
-from ..run.settings import DistanceKind
+from ..run.settings import PairKind
 
 
 @made_once
@@ -118,7 +118,7 @@ class DifferentiableContacts:
         x1: wp.array,
         mesh: CollisionMesh,
         tolerance: float,
-        contacts: Mapping[DistanceKind, ContactBuffer],
+        contacts: Mapping[PairKind, ContactBuffer],
         radius: wp.array | None = None,
     ):
         """Launches the kernels that compute the arrays, and records them on the tape.
@@ -143,7 +143,7 @@ class DifferentiableContacts:
             launch(kernel, len(found.pairs), inputs=[*inputs, found], outputs=outputs, device=mesh.device)
             setattr(self, kind.label, found.pairs)
             results = {"toi": toi, "normal": normal, "grazing": grazing}
-            if kind != DistanceKind.VERTEX_VERTEX:
+            if kind != PairKind.VERTEX_VERTEX:
                 results["coordinates"] = coordinates
             for name, array in results.items():
                 setattr(self, f"{kind.label}_{name}", array)

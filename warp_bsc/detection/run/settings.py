@@ -31,8 +31,13 @@ NO_FUSED_OPERATIONS = NO_GRADIENTS | {"module_options": {"fuse_fp": False}}
 """The same for a kernel that decides: without fused operations every device computes the same bits."""
 
 
-class _Kind(enum.IntEnum):
-    """A kind of pairs, with its number in kernels."""
+class PairKind(enum.IntEnum):
+    """The kinds of pairs, with their numbers in kernels; those of points have a minimum distance."""
+
+    VERTEX_FACE = int(polynomials.VERTEX_FACE)
+    EDGE_EDGE = int(polynomials.EDGE_EDGE)
+    VERTEX_EDGE = int(polynomials.VERTEX_EDGE)
+    VERTEX_VERTEX = int(polynomials.VERTEX_VERTEX)
 
     @property
     def label(self) -> str:
@@ -44,33 +49,21 @@ class _Kind(enum.IntEnum):
         """The name in tables and messages: "vertex-face" and so on."""
         return self.label.replace("_", "-")
 
-
-class PairKind(_Kind):
-    """The two kinds of pairs, with their numbers in kernels."""
-
-    VERTEX_FACE = int(polynomials.VERTEX_FACE)
-    EDGE_EDGE = int(polynomials.EDGE_EDGE)
-
-
-class DistanceKind(_Kind):
-    """The kinds of pairs that may have a minimum distance, with their numbers in kernels."""
-
-    VERTEX_FACE = int(polynomials.VERTEX_FACE)
-    EDGE_EDGE = int(polynomials.EDGE_EDGE)
-    VERTEX_EDGE = int(polynomials.VERTEX_EDGE)
-    VERTEX_VERTEX = int(polynomials.VERTEX_VERTEX)
-
     @property
     def point_order(self) -> list[int]:
         """The point of the pair for each of the four arguments of kernels: p a b a, p q q q."""
-        if self == DistanceKind.VERTEX_EDGE:
+        if self == PairKind.VERTEX_EDGE:
             return [0, 1, 2, 1]
-        return [0, 1, 1, 1] if self == DistanceKind.VERTEX_VERTEX else [0, 1, 2, 3]
+        return [0, 1, 1, 1] if self == PairKind.VERTEX_VERTEX else [0, 1, 2, 3]
 
     @property
     def points(self) -> int:
         """Number of points of a pair."""
         return max(self.point_order) + 1
+
+
+SURFACE_KINDS = PairKind.VERTEX_FACE, PairKind.EDGE_EDGE
+"""The kinds of pairs that touch without a minimum distance."""
 
 
 def checked_tolerance(tolerance: float) -> float:
@@ -148,7 +141,7 @@ class PairCounts(NamedTuple):
         """Number of pairs that are reported."""
         return self.found - self.refuted
 
-    def overflows(self, capacities: "PairCounts", kind: PairKind | DistanceKind) -> list[str]:
+    def overflows(self, capacities: "PairCounts", kind: PairKind) -> list[str]:
         """Names each buffer of a kind that is too small for these counts, with count and capacity."""
         return [
             f"{kind.label} {count.name.lower()}: {needed} do not fit in the capacity {capacity}"
@@ -168,7 +161,7 @@ class Counter(enum.IntEnum):
     PAIRS = 2  # the first of those of each kind of pair, by :class:`Count`
 
 
-FILTERED_COUNTS = range(Counter.PAIRS + Count.FILTERED, Counter.PAIRS + len(DistanceKind) * len(Count), len(Count))
+FILTERED_COUNTS = range(Counter.PAIRS + Count.FILTERED, Counter.PAIRS + len(PairKind) * len(Count), len(Count))
 """Indices of the pairs that are filtered, of each kind."""
 
 
@@ -193,9 +186,9 @@ class Counts:
     vertex_vertex: PairCounts = _NO_PAIRS
 
     @property
-    def pairs(self) -> dict[DistanceKind, PairCounts]:
+    def pairs(self) -> dict[PairKind, PairCounts]:
         """The counts of each kind of pair."""
-        return {kind: getattr(self, kind.label) for kind in DistanceKind}
+        return {kind: getattr(self, kind.label) for kind in PairKind}
 
     def without_filtered(self) -> "Counts":
         """Returns the counts with no pair that is filtered."""
@@ -237,16 +230,16 @@ class Counters:
     def __init__(self, device: wp.Device):
         """Allocates the counters on a device, all zero."""
         n = len(Count)
-        self.array = wp.zeros(Counter.PAIRS + n * len(DistanceKind), dtype=wp.int64, device=device)
+        self.array = wp.zeros(Counter.PAIRS + n * len(PairKind), dtype=wp.int64, device=device)
         self.not_finite = self.array[Counter.NOT_FINITE : Counter.FACE_PAIRS]
         self.face_pairs = self.array[Counter.FACE_PAIRS : Counter.PAIRS]
         self.pairs = self.array[Counter.PAIRS :]
         self.vertex_face, self.edge_edge, self.vertex_edge, self.vertex_vertex = (
-            self.pairs[n * kind : n * (kind + 1)] for kind in DistanceKind
+            self.pairs[n * kind : n * (kind + 1)] for kind in PairKind
         )
 
     def read(self) -> Counts:
         """Returns the counts on the host; synchronizes with the device."""
         not_finite, face_pairs, *pairs = self.array.numpy().tolist()
         n = len(Count)
-        return Counts(not_finite, face_pairs, *(PairCounts(*pairs[n * kind : n * (kind + 1)]) for kind in DistanceKind))
+        return Counts(not_finite, face_pairs, *(PairCounts(*pairs[n * kind : n * (kind + 1)]) for kind in PairKind))

@@ -16,7 +16,7 @@ from ....kernels.polynomials import Motion
 from ....kernels.signs import FREE, HIT, ROUNDOFF, UNSURE
 from ...run.launch import launch_over, made_once
 from ...run.phase_timer import PhaseTimer
-from ...run.settings import NO_FUSED_OPERATIONS, TOLERANCE, Count, DistanceKind, Method
+from ...run.settings import NO_FUSED_OPERATIONS, TOLERANCE, Count, Method
 from ..exact_phase import launch_exact_distances
 from ..narrow_phase import Phases, buffers_of, launch_culls
 from ..pair_kernels import PairBuffers, PairRule, count_found, take_contact, write_decision, write_impact
@@ -227,4 +227,4 @@ def run_distances(
         with timer.phase("exact"):
             of_times = {"timed": timed, "tolerance": tolerance}
             for kind, s in buffers.items():
-                launch_exact_distances(x0, x1, radius, DistanceKind(kind), **of_times, buffers=s)
+                launch_exact_distances(x0, x1, radius, kind, **of_times, buffers=s)
