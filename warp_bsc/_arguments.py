@@ -254,16 +254,9 @@ def checked_integers(integers: Any, name: str, count: int, end: int) -> np.ndarr
 
 
 def checked_bits(bits: Any, name: str, count: int) -> np.ndarray:
-    """Returns 32 bits for each of some things, uint32, shape (count,).
+    """Returns 32 bits for each of some things, uint32, shape (count,), with errors as of :func:`checked_integers`.
 
-    Args:
-        bits: Integers in [0, 2^32), or -1 for all bits; one, or an array of shape (count,).
-        name: Name of the argument in errors.
-        count: Number of things.
-
-    Raises:
-        TypeError: If they are no integers.
-        ValueError: If they have another shape, are masked, or are out of range.
+    They are integers in [0, 2^32), or -1 for all bits; one, or an array of shape (count,).
     """
     return _checked_integers(bits, name, count, -1, 2**32, "in [0, 2^32), or -1 for all bits").astype(np.uint32)
 

@@ -119,13 +119,7 @@ class FrameFiles:
         """
         if frame.before:
             return  # there is no file of the moment before the faces change
-        rows = np.full(frame.segment.vertex_count, -1)
-        rows[frame.vertices] = np.arange(len(frame.vertices))
-        moved = {}
-        for number, mesh in enumerate(frame.segment.meshes):
-            own = rows[frame.segment.vertices_of(number)]
-            moved[number] = mesh.points[own >= 0], frame.x[own[own >= 0]]
-        self._write(frame.time, moved)
+        self._write(frame.time, {number: (points, x) for number, points, x in frame.by_mesh()})
 
     def finish(self, _facts: dict) -> None:
         """Writes the other frames, which are as they were; errors as of :meth:`add`."""

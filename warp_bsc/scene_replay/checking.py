@@ -301,10 +301,7 @@ class _SegmentNamer:
     def name_intersections(self, found: Intersections, x: np.ndarray, time: float) -> SceneIntersections:
         """Returns the named intersections of a time, with the parts inside meshes; those named last, if the same.
 
-        Args:
-            found: The intersections.
-            x: Positions at that time, shape [vertex_count, 3].
-            time: Time code.
+        Arguments are those of :func:`.scene_intersections.name_intersections`.
         """
         if self._intersections is None or self._intersections[0] is not found:
             assert self._containment and self._duplicates

@@ -15,15 +15,8 @@ from .threads import read_ahead
 def find_earlier(path: str | os.PathLike, facts: dict[str, Any]) -> "EarlierReplay | None":
     """Returns the earlier replay with the most intervals that has written, or was to write, a JSON file; None for none.
 
-    A killed replay has left its intervals at :func:`~warp_bsc._atomic_file.unfinished_path`.
-
-    Args:
-        path: The file.
-        facts: As of :class:`EarlierReplay`.
-
-    Raises:
-        OSError: As of :class:`EarlierReplay`.
-        ValueError: As of :class:`EarlierReplay`, if there are files but no replay that can be resumed.
+    A killed replay has left its intervals at :func:`~warp_bsc._atomic_file.unfinished_path`. Arguments and errors are
+    those of :class:`EarlierReplay`; a ValueError is raised if there are files but no replay that can be resumed.
     """
     found, errors = [], []
     for file in filter(os.path.exists, (unfinished_path(path), path)):

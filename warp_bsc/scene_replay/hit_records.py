@@ -210,13 +210,7 @@ def _read_elements(interval: Interval, rows: list[dict], names: list[str]) -> di
 
 
 def interval_line(result: IntervalResult, kinds: Sequence[str], numbers: Mapping[str, int]) -> Iterator[str | bytes]:
-    """Yields the text of an interval, without its line break.
-
-    Args:
-        result: The result.
-        kinds: Labels of the kinds of pair whose numbers are written.
-        numbers: Numbers of meshes in the file, by name.
-    """
+    """Yields the text of an interval, without its line break; arguments are those of :func:`.summary_fields`."""
     contacts = result.contacts
     is_joined = contacts.interval.is_joined
     of_meshes = np.array([numbers[mesh.name] for mesh in contacts.segment.meshes], dtype=np.int64)

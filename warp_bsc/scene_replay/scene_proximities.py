@@ -38,14 +38,7 @@ def name_proximities(
     """Names the proximities that are checked by prims and elements.
 
     Excluded are pairs that the selection excludes or ignores, and pairs of a mesh with itself if only its transform
-    moves it. Meshes that never move are checked.
-
-    Args:
-        segment: The segment.
-        mesh: The mesh of the segment.
-        found: The proximities.
-        time: Time code.
-        selection: The pairs of meshes that are checked.
+    moves it. Meshes that never move are checked. Arguments are those of :func:`.name_intersections`.
     """
     if not len(found.distance):
         return SceneProximities(segment, **NO_PAIRS, time=time, distance=np.zeros(0))

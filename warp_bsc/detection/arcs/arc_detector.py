@@ -35,13 +35,9 @@ class ArcDetector:
         self._by_parts: tuple[ArcSearch, CollisionFinder | None] | None = None  # the second for vertices without bodies
 
     def find(self, arcs: RigidMotion, x0: wp.array, x1: wp.array, changed: wp.array | None) -> Collisions:
-        """Returns the collisions of a motion, with errors as of :meth:`.CollisionDetector.detect`.
+        """Returns the collisions of a motion of bodies that turn, of one vertex at least.
 
-        Args:
-            arcs: The bodies that turn, of one vertex at least.
-            x0: Positions at the start, Warp array of vec3 or vec3d on the mesh's device.
-            x1: Positions at the end, of the same type.
-            changed: Nonzero for each vertex of interest, Warp array of int; None for all.
+        Other arguments are those of :meth:`.CollisionFinder.find`, errors those of :meth:`.CollisionDetector.detect`.
         """
         if x0.requires_grad or x1.requires_grad:
             raise ValueError("rigid_motion: x0 and x1 must not require gradients")

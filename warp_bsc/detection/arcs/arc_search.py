@@ -28,12 +28,7 @@ are not much larger than those of their elements."""
 
 
 def straight_mesh(mesh: CollisionMesh, turns: np.ndarray) -> CollisionMesh:
-    """Returns a mesh with the same elements, in which pairs with a turning vertex are left out.
-
-    Args:
-        mesh: The mesh.
-        turns: Which vertices turn, bool, shape [vertex_count].
-    """
+    """Returns a mesh with the same elements, in which pairs with a vertex that turns are left out."""
     group = np.uint32(1) if mesh.group is None else mesh.group
     return CollisionMesh(
         mesh.faces,
@@ -80,11 +75,7 @@ class ArcSearch:
     ) -> tuple[dict[PairKind, HostContacts], Counts]:
         """Returns the contacts of each kind of pair, the first of each pair, and the counts of all parts together.
 
-        Args:
-            bounds: The motion, and how far it is from its chords.
-            x0: Positions at the start, Warp array of vec3 or vec3d.
-            changed: Nonzero for each vertex of interest, Warp array of int; None for all.
-            timer: Measures the phases.
+        Other arguments than the motion and its bounds are those of :meth:`.DetectionPipeline.find_contacts`.
         """
         self._bounds, self._changed, self._timer = bounds, changed, timer
         self._pipeline.set_bodies(bounds.body)

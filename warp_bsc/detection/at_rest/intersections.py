@@ -202,15 +202,8 @@ class IntersectionFinder:
     def find(self, x: ArrayLike | wp.array, *, is_end: bool = False) -> Intersections:
         """Returns the intersections of one configuration.
 
-        Args:
-            x: Positions, any unit of length, shape [vertex_count, 3], float32 or float64, NumPy or Warp array. Those of
-                vertices that no face uses may be anything.
-            is_end: Whether they are those at the end of the motion that the given broad phase has boxed last, with all
-                vertices of interest.
-
-        Raises:
-            TypeError: If the positions are no array of numbers.
-            ValueError: If they have another shape or type, or are not finite.
+        Positions and errors are those of :meth:`.CollisionDetector.find_intersections`. With ``is_end`` the positions
+        are those at the end of the motion that the given broad phase has boxed last, with all vertices of interest.
         """
         options = {"counts": self._counts, "is_end": is_end}
         return self._find(x, lambda x: self._broad_phase.pair_edges_with_faces(x, pairs=self._pairs, **options))

@@ -277,13 +277,9 @@ class WideTree:
         return self._size > _LOOSE * self._sorted_size
 
     def sort(self, x0: wp.array, x1: wp.array, low: np.ndarray, scale: np.ndarray) -> None:
-        """Sorts the elements along a Hilbert curve of a motion's grid.
+        """Sorts the elements along a Hilbert curve of the grid of a motion, as of :meth:`fit`.
 
-        Args:
-            x0: Positions at the start, Warp array of vec3 or vec3d.
-            x1: Positions at the end, of the same type.
-            low: Lowest corner of the grid, float64, shape [3].
-            scale: Cells of the grid per unit of length along each axis, float64, shape [3].
+        The grid has its lowest corner at ``low``, and ``scale`` cells per unit of length along each axis.
         """
         encode, _ = _kernels(x0.dtype)
         n, device = len(self._corners), self._corners.device
@@ -300,10 +296,7 @@ class WideTree:
     def fit(self, x0: wp.array, x1: wp.array, changed: wp.array | None = None) -> None:
         """Computes the boxes of all packets and nodes for a motion, without sorting.
 
-        Args:
-            x0: Positions at the start, Warp array of vec3 or vec3d.
-            x1: Positions at the end, of the same type.
-            changed: As of :meth:`.BroadPhaseHierarchy.pair_elements`.
+        Arguments are those of :meth:`.BroadPhaseHierarchy.pair_elements`.
         """
         _, fit_packets = _kernels(x0.dtype)
         inputs, device = [x0, x1, len(self._corners), changed, self._padding], self._corners.device

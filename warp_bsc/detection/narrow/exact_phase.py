@@ -179,14 +179,7 @@ def launch_exact_distances(
 ) -> None:
     """Decides contacts with a minimum distance exactly, and counts those delegated to the host; does not synchronize.
 
-    Args:
-        x0: Positions at the start of the step, array of vec3 or vec3d.
-        x1: Positions at its end, of the same type.
-        radius: Radius of each vertex, array of float64.
-        kind: The kind of pair.
-        timed: Whether to find times of impact.
-        tolerance: Of the times of impact, as a share of the step.
-        buffers: The buffers of the narrow phase.
+    Arguments are those of :func:`.run_distances`, for one kind of pair, with the buffers of its narrow phase.
     """
     digits = 1 + max(MIN_DIGITS, math.ceil(-math.log2(tolerance)))
     for limbs in DISTANCE_BITS:

@@ -309,9 +309,7 @@ class UsdMesh:
     def read_transform(self, time: float, *, before: bool = False) -> np.ndarray | None:
         """Returns the matrix that transforms points, as rows, to world space, shape [4, 4]; None if it has none then.
 
-        Args:
-            time: Time code, of the scene or between its times.
-            before: As of :meth:`read_positions`.
+        The time code is one of the scene or between its times; ``before`` is as of :meth:`read_positions`.
         """
         return self.transforms.read_one(self.instance, self.time_code(time, before))
 

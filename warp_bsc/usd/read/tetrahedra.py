@@ -47,9 +47,7 @@ class Tetrahedra:
     def positions(self, time: float, *, before: bool = False) -> np.ndarray:
         """Returns the positions of the vertices in the spaces of their prims, float64, shape [vertex_count, 3].
 
-        Args:
-            time: Time code.
-            before: Whether to read the moment just before that time.
+        They are those at a time code, or ``before`` it, the moment just before.
 
         Raises:
             UnreadableError: If a mesh has another number of points than at first, or a coordinate is not finite.

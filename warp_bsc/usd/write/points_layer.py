@@ -35,6 +35,15 @@ class MovedFrame:
     vertices: np.ndarray = field(repr=False)
     x: np.ndarray = field(repr=False)
 
+    def by_mesh(self) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+        """Yields the number of each mesh with moved vertices, these among its prim's points, and their positions."""
+        rows = np.full(self.segment.vertex_count, -1)
+        rows[self.vertices] = np.arange(len(self.vertices))
+        for number, mesh in enumerate(self.segment.meshes):
+            own = rows[self.segment.vertices_of(number)]
+            if (own >= 0).any():
+                yield number, mesh.points[own >= 0], self.x[own[own >= 0]]
+
 
 class PointsLayer:
     """A layer whose sublayer is the scene, so that opening it shows the scene with the moved points.
@@ -73,19 +82,13 @@ class PointsLayer:
         Raises:
             OSError: If the disk is full.
         """
-        rows = np.full(frame.segment.vertex_count, -1)
-        rows[frame.vertices] = np.arange(len(frame.vertices))
-        for number, mesh in enumerate(frame.segment.meshes):
-            own = rows[frame.segment.vertices_of(number)]
-            if (own >= 0).any():
-                prim = self._scene.prim_of(mesh.name)
-                x = _to_own_space(prim, frame.x[own[own >= 0]], frame.time, frame.before)
-                points = mesh.points[own >= 0]
-                at = self._moved.setdefault(mesh.name, {})
-                at[frame.time, frame.before] = self._moves.tell(), len(points)
-                rest = memoryview(points.astype(np.int64).tobytes() + x.tobytes())
-                while rest:
-                    rest = rest[self._moves.write(rest) :]
+        for number, points, positions in frame.by_mesh():
+            name = frame.segment.meshes[number].name
+            x = _to_own_space(self._scene.prim_of(name), positions, frame.time, frame.before)
+            self._moved.setdefault(name, {})[frame.time, frame.before] = self._moves.tell(), len(points)
+            rest = memoryview(points.astype(np.int64).tobytes() + x.tobytes())
+            while rest:
+                rest = rest[self._moves.write(rest) :]
 
     def finish(self, facts: dict[str, Any]) -> None:
         """Writes the layer and moves it to its path.
