@@ -87,19 +87,29 @@ def test_layer_of_a_free_shot_shows_it_as_it_is(tmp_path, capsys):
 
 def test_frames_with_wrecked_edges_are_not_good(tmp_path, capsys):
     """Free and certified is not enough: a status and a line tell, and the page begins with the worst one."""
-    stage, page = dipping_sheet(tmp_path, dip=-1.0), tmp_path / "moves.html"
+    stage, page = dipping_sheet(tmp_path, dip=-6.0), tmp_path / "moves.html"
     output = repaired(stage, "--fail-on", "distorted", "--report", str(page), status=1)
     printed = capsys.readouterr().out
     assert "Not good: 1 frame, with edges shorter than a third of the shot's" in printed and ", 0 remain." in printed
     assert f"; at {HIT} the worst, 0." in printed
     ends = np.array(quads()).reshape(-1, 4)[:, :2]
-    lengths = [np.linalg.norm(np.diff(x[ends], axis=1), axis=2) for x in (points_of(output, HIT), sheet(0.116, -1.0))]
+    lengths = [np.linalg.norm(np.diff(x[ends], axis=1), axis=2) for x in (points_of(output, HIT), sheet(0.116, -6.0))]
     assert (lengths[0] / lengths[1]).min() < 0.34
     frames = Page(page.read_text()).data["frames"]
     assert [frame["distortion"] > 2.9 for frame in frames] == [frame["time"] == HIT for frame in frames]
     repaired(stage, "--json", "--fail-on", "remaining")
     found = json.loads(capsys.readouterr().out)
     assert found["distorted"] == [HIT] and found["stretches"][0]["edge_ratio"][0] < 1.0 / 3.0
+
+
+@pytest.mark.parametrize("dip", [-0.5, -1.0, -2.0])
+def test_springs_relax_what_contacts_strain(tmp_path, capsys, dip):
+    """Contacts alone press the middle of the sheet flat, with edges at a third of their lengths."""
+    repaired(dipping_sheet(tmp_path, dip=dip), "--json", "--fail-on", "remaining")
+    found = json.loads(capsys.readouterr().out)
+    (stretch,) = found["stretches"]
+    assert found["remaining"] == {"collisions": 0, "intersections": 0} and not stretch["uncertified"]
+    assert stretch["edge_ratio"][0] > 0.9 and stretch["edge_ratio"][1] < 1.1
 
 
 def test_kept_meshes_do_not_move_and_are_not_left(tmp_path, capsys):

@@ -7,6 +7,7 @@ from usd_stages import FALLING, add_mesh, moved, new_stage, save
 
 import warp_bsc as bsc
 from warp_bsc.scene_replay.scene_arcs import arcs_of
+from warp_bsc.usd.read.meshes import UsdMesh
 
 
 @pytest.fixture
@@ -154,3 +155,34 @@ def test_instances_of_an_instancer_turn_each_about_its_own_axis(stage):
     found = {number: np.degrees(turn.vector[2]) for number, turn in interval.turns.items()}
     assert found == {0: pytest.approx(120, abs=1e-4), 1: pytest.approx(-60, abs=1e-4)}
     np.testing.assert_allclose(interval.turns[1].centre, [5, 0, 0], atol=1e-6)
+
+
+def test_instances_turn_with_what_is_above_their_instancer(stage):
+    turning(UsdGeom.Xform.Define(stage, "/World/Arm").AddRotateZOp(), 0.0, 90.0)
+    instancer = UsdGeom.PointInstancer.Define(stage, "/World/Arm/Fans")
+    add_mesh(stage, "/World/Arm/Fans/Fan", FALLING)
+    instancer.CreatePrototypesRel().SetTargets(["/World/Arm/Fans/Fan"])
+    instancer.CreateProtoIndicesAttr([0, 0])
+    instancer.CreatePositionsAttr([(0, 0, 0), (5, 0, 0)])
+    (interval,) = bsc.Scene(save(stage))
+    assert [np.degrees(turn.vector[2]) for turn in interval.turns.values()] == pytest.approx([90, 90], abs=1e-4)
+
+
+def test_transforms_that_translations_alone_change_are_not_read_between_the_times(stage, monkeypatch):
+    """A crowd of thousands of instances that slide would be read three times an interval."""
+    for name in ("Sliding", "Turning"):
+        mesh = add_mesh(stage, f"/World/{name}", FALLING)
+        turning(mesh.AddTranslateOp(), (0, 0, 0), (1, 2, 3))
+        mesh.AddRotateZOp().Set(30.0)
+        if name == "Turning":
+            turning(mesh.AddRotateXOp(), 0.0, 90.0)
+    scene, read = bsc.Scene(save(stage)), []
+    ordinary = UsdMesh.read_transform
+
+    def recorded(mesh, *arguments, **options):
+        read.append(mesh.name)
+        return ordinary(mesh, *arguments, **options)
+
+    monkeypatch.setattr(UsdMesh, "read_transform", recorded)
+    (interval,) = scene
+    assert list(interval.turns) == [1] and set(read) == {"/World/Turning"}

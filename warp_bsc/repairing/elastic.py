@@ -9,7 +9,6 @@ from .kernels import Planes, grow_ring, relax_springs, spread_moves
 from .surface import Surface
 
 _BENDING = 0.3
-"""Stiffness of the springs across edges, which keep dihedral angles, as a share of that of edges."""
 _SHORTEST = 10.0
 """Median length of an edge, in lengths of a spring, up to which shorter springs are stiffer, so that strains even out.
 """
@@ -45,12 +44,13 @@ class Springs:
         movable: Vertices that they move, bool, shape [n].
     """
 
-    def __init__(self, surface: Surface, movable: np.ndarray):
+    def __init__(self, surface: Surface, movable: np.ndarray, bending: float = _BENDING):
         """Finds the springs.
 
         Args:
             surface: The surface.
             movable: Vertices that they may move, bool, shape [n].
+            bending: Stiffness of the springs across edges, which keep dihedral angles, as a share of that of edges.
         """
         self._surface, self.movable = surface, movable
         vertices = self._vertices = np.flatnonzero(movable)
@@ -58,21 +58,31 @@ class Springs:
         edges = np.flatnonzero(movable[first] | movable[second])
         self._edges = surface.array(surface.edges[edges], int)
         across = _vertices_across(surface, movable)
-        ends = np.concatenate([surface.edges[edges], across])
-        stiffness = np.repeat([1.0, _BENDING], [len(edges), len(across)])
-        lengths = np.linalg.norm(surface.home[ends[:, 1]] - surface.home[ends[:, 0]], axis=1)
-        both = np.concatenate([ends, ends[:, ::-1]])
+        self._ends = np.concatenate([surface.edges[edges], across])
+        self._stiffness = np.repeat([1.0, bending], [len(edges), len(across)])
+        both = np.concatenate([self._ends, self._ends[:, ::-1]])
         order = np.argsort(both[:, 0], kind="stable")
-        order = order[movable[both[order, 0]]]
+        order = self._order = order[movable[both[order, 0]]]
         array = surface.array
         self._springs = [
             array(vertices, int),
             array(np.append(np.searchsorted(both[order, 0], vertices), len(order)), int),
             array(both[order, 1], int),
         ]
-        shortness = np.clip(surface.edge / np.maximum(lengths, 1e-30), 0.1, _SHORTEST)
+        self.rest_at(surface.home, surface.edge)
+
+    def rest_at(self, x: np.ndarray, edge: float) -> None:
+        """Lets the springs rest at positions, in any unit, as those of :meth:`relax` from then on.
+
+        Args:
+            x: The positions, shape [n, 3].
+            edge: Median length of an edge there.
+        """
+        lengths = np.linalg.norm(x[self._ends[:, 1]] - x[self._ends[:, 0]], axis=1)
+        shortness = np.clip(edge / np.maximum(lengths, 1e-30), 0.1, _SHORTEST)
         self._lengths, self._even, self._by_strain = (
-            array(np.tile(values, 2)[order], wp.float64) for values in (lengths, stiffness, stiffness * shortness**2)
+            self._surface.array(np.tile(values, 2)[self._order], wp.float64)
+            for values in (lengths, self._stiffness, self._stiffness * shortness**2)
         )
 
     def around(self, vertices: np.ndarray, rings: int) -> np.ndarray:

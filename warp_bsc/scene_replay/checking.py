@@ -337,11 +337,14 @@ class _StrandChecker:
 
     def __init__(self, segment: Segment, checks: Checks):
         self._segment = segment
+        ends = segment.free_edges
+        edges = ends[ends[:, 0] != ends[:, 1]]  # the others join points of a curve that are always in one place
+        alone = np.setdiff1d(ends, np.concatenate([edges.ravel(), segment.faces.ravel()]))
         self.mesh = CollisionMesh(
             segment.faces,
             segment.vertex_count,
-            edges=segment.free_edges,
-            points=segment.points,
+            edges=edges,
+            points=np.concatenate([segment.points, alone]),
             radius=segment.radius,
             only_free=True,
             device=checks.device,

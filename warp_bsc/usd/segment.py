@@ -171,8 +171,8 @@ class Segment:
         def transform(number: int, share: float) -> np.ndarray | None:
             return self._usd_meshes[number].read_transform(start + share * (end - start), before=share == 1.0)
 
-        meshes = enumerate(self.meshes)
-        return find_turns(transform, [number for number, mesh in meshes if mesh.moves and not mesh.deforms])
+        turning = [mesh.turns and mesh.transforms.may_turn and not mesh.deforms for mesh in self._usd_meshes]
+        return find_turns(transform, np.flatnonzero(turning).tolist())
 
     @property
     def has_strands(self) -> bool:

@@ -47,6 +47,12 @@ def with_points(prim, by_time, widths, interpolation):
     return prim
 
 
+def hits_as_numbers(found):
+    """Times and places of collisions, rounded."""
+    contacts = [contact for interval in found["intervals"] for contact in interval["contacts"]]
+    return [(round(c["time"], 6), tuple(round(float(x), 6) for x in c["position"])) for c in contacts]
+
+
 def lowered(points, *heights):
     return {time: moved(points, (0, 0, height)) for time, height in enumerate(heights)}
 
@@ -262,6 +268,29 @@ def test_a_closed_rope_is_near_itself_at_its_seam(stage):
     rope.CreateWrapAttr("nonperiodic")
     (result,) = bsc.replay(bsc.Scene(save(stage)), device="cpu")
     assert len(result.contacts.segment.free_edges) == 31 and len(result.contacts) > 0  # its ends meet
+
+
+def test_points_of_a_curve_in_one_place_have_no_edge_between_them(tmp_path):
+    """Recorded tracks have such points; a curve that is all in one place is a point with its radius."""
+    first, middle, last = [(0.1, -0.5, 0.0), (0.5, -0.5, 0.0), (0.9, -0.5, 0.0)]
+    alone = (-0.5, -0.25, 0.0)
+    ropes = [first, middle, last], [first, first, middle, last, last, last, alone, alone]
+    found = []
+    for number, (points, counts) in enumerate(zip(ropes, ([3], [6, 2]), strict=True)):
+        stage = floor_stage(tmp_path / str(number))
+        add_rope(stage, "/World/Rope", lowered(points, 1, -1), [0.25], counts=counts)
+        found.append(sorted(hits_as_numbers(find(stage))))
+    plain, repeated = found
+    assert [hit for hit in repeated if hit[1] != alone] == plain
+    assert [hit for hit in repeated if hit[1] == alone] == [(0.4375, alone)]
+
+
+def test_a_closed_rope_may_end_where_it_begins(stage):
+    angles = np.linspace(0, 2 * np.pi, 33)
+    ring = [(float(np.cos(a)), float(np.sin(a)), 1.0) for a in angles]
+    ring[-1] = ring[0]
+    add_rope(stage, "/World/Rope", lowered(ring, 0, 0.5), [0.5]).CreateWrapAttr("periodic")
+    assert find(stage)["hits"] == 0
 
 
 def test_meshes_collide_as_they_do_without_ropes(stage):

@@ -12,6 +12,8 @@ from ...detection.detector import CollisionDetector
 from ...detection.mesh import CollisionMesh
 from ...detection.run.launch import launch, launch_in_turn
 from ..contacts import Contacts, as_contacts, projected
+from ..elastic import Springs
+from ..surface import Surface
 from .follow_kernels import find_directions, normalize, smooth
 
 if TYPE_CHECKING:
@@ -37,6 +39,14 @@ _LARGEST_STEP = 1.0
 """Largest displacement of a vertex that is spread, as a share of that length."""
 _EARLIEST = 0.06
 """Time of a contact on an arc, as a share of the step: an earlier one is resolved as one at this time."""
+_STRAINED = 0.1
+"""Share by which an edge is longer or shorter from which on springs relax a frame, and half of what they leave."""
+_RELAXATIONS, _RELAXING_SWEEPS, _MOMENTUM = 12, 40, 0.8
+"""Detections, sweeps of the springs before each, and the momentum of these."""
+_RINGS = 10
+"""Edges around displaced vertices within which springs move others."""
+_LEAST_LENGTH = 1e-3
+"""Length of an edge, as a share of the median, below which any change of its length is small."""
 _TIMES = 9
 """Times from a contact on an arc on at which it is looked how far the elements would pass through each other."""
 
@@ -52,12 +62,14 @@ class FollowedFrame:
         certified: Whether the motion to these positions, straight or on arcs, is free of collisions, and keeps the
             distance.
         contacts: The contacts that are kept apart there.
+        unrelaxed: Positions before springs relaxed them, which are free as well; None if they have not.
     """
 
     x: np.ndarray
     displacement: np.ndarray
     certified: bool
     contacts: Contacts
+    unrelaxed: np.ndarray | None = None
 
 
 class Follower:
@@ -66,8 +78,8 @@ class Follower:
     Contacts are moved apart, which would strain the edges around them. So their displacements are spread over the mesh,
     first widely, then less, and added to the given positions: the neighbourhood of a contact moves with it, and keeps
     the shape that it has in the given positions. All contacts that are known stay apart meanwhile, so that few are new
-    in the next detection, which looks at the vertices alone whose motion has changed. What still collides after many
-    is delegated to :class:`warp_bsc.SolverCCD`.
+    in the next detection, which looks at the vertices alone whose motion has changed. What contacts strain all the same
+    is relaxed by springs. What still collides after many detections is delegated to :class:`warp_bsc.SolverCCD`.
 
     Attributes:
         mesh: The mesh.
@@ -115,6 +127,7 @@ class Follower:
         known: Contacts,
         free_start: np.ndarray | None = None,
         arcs: RigidMotion | None = None,
+        relaxes: bool = False,
     ) -> FollowedFrame:
         """Returns positions near given ones that a straight motion reaches without a collision.
 
@@ -129,6 +142,7 @@ class Follower:
             free_start: Positions from which the straight motion to the given ones is known to be free, so that only
                 vertices that move otherwise are looked at; None if it is not known.
             arcs: The obstacles that turn on their way and how; None if all move straight.
+            relaxes: Whether springs that rest at the given positions relax what contacts strain.
         """
         tolerance *= self.length
         device_start = self.mesh.device_positions(start, "start")
@@ -167,13 +181,61 @@ class Follower:
                     target = _displaced(given, displacement)
                     x = self._moved_apart(target, known)
             changed = touched | (x.astype(np.float32) != last).any(axis=1)
-        if best is not None:
-            return best[1]
+        frame = FollowedFrame(target, displacement, False, known) if best is None else best[1]
+        if relaxes:
+            frame = self._relaxed(frame, start, given, arcs)
+        if frame.certified:
+            return frame
         x, certified = self._playback.step(start, x.astype(np.float32))
         if certified and arcs is not None:  # the stage knows the chords alone
             _, touched = self._contacts(device_start, x, self._is_movable, arcs)
             certified = not touched.any()
-        return FollowedFrame(x, displacement, certified, known)
+        frame = FollowedFrame(x, displacement, certified, known)
+        return self._relaxed(frame, start, given, arcs) if relaxes and certified else frame
+
+    def _relaxed(
+        self, frame: FollowedFrame, start: np.ndarray, given: np.ndarray, arcs: RigidMotion | None
+    ) -> FollowedFrame:
+        """Returns a frame with less strain, or any that is free if the given one is not; that one if none is found.
+
+        Arguments are those of :meth:`follow`.
+        """
+        strain = self._strain(frame.x, given) if frame.certified else np.inf
+        if strain < _STRAINED:
+            return frame
+        springs, known, x = self._springs, frame.contacts, frame.x.astype(np.float64)
+        springs.rest_at(given.astype(np.float64), self.length)
+        displaced = np.asarray((frame.x != given).any(axis=1))
+        displaced[known.vertices] = True
+        around, device_start = springs.around(displaced, _RINGS), self.mesh.device_positions(start, "start")
+        for _ in range(_RELAXATIONS):
+            goal = springs.relax(
+                x, _RELAXING_SWEEPS, 0.5 * _STRAINED, momentum=_MOMENTUM, contacts=known, around=around
+            )
+            goal = self._moved_apart(goal, known).astype(np.float32)
+            changed = (goal != frame.x).any(axis=1) if frame.certified else self._is_movable
+            contacts, touched = self._contacts(device_start, goal, changed, arcs)
+            if touched.any():
+                if arcs is not None:
+                    contacts = _on_arcs(contacts, arcs, start, goal)
+                known = Contacts.joined([known, contacts])
+                continue
+            remaining = self._strain(goal, given)
+            if remaining >= strain:
+                break
+            unrelaxed = frame.unrelaxed if frame.unrelaxed is not None else frame.x if frame.certified else None
+            frame = FollowedFrame(goal, frame.displacement, True, known, unrelaxed)
+            strain = remaining
+            if strain < _STRAINED:
+                break
+            x = goal.astype(np.float64)
+        return frame
+
+    def _strain(self, x: np.ndarray, given: np.ndarray) -> float:
+        """Returns the largest share by which an edge is longer than in given positions, or shorter."""
+        lengths = [np.linalg.norm(y[self.edges[:, 1]] - y[self.edges[:, 0]], axis=1) for y in (x, given)]
+        length, rest = (np.maximum(values, _LEAST_LENGTH * self.length) for values in lengths)
+        return float(np.maximum(length / rest, rest / length).max(initial=1.0)) - 1.0
 
     def near(self, contacts: Contacts, x: np.ndarray) -> Contacts:
         """Returns the contacts of which the elements are still near each other at positions, with directions there.
@@ -238,6 +300,11 @@ class Follower:
         ]
         launch(find_directions, count, inputs=inputs, outputs=[weights, normals], device=self._device)
         return replace(contacts, weights=weights.numpy(), normals=normals.numpy())
+
+    @functools.cached_property
+    def _springs(self) -> Springs:
+        # a shot that passes through itself often has folds that it cannot keep
+        return Springs(Surface(self.mesh, self._x, ~self._is_movable), self._is_movable, bending=0.0)
 
     @functools.cached_property
     def _playback(self) -> "Playback":

@@ -18,7 +18,7 @@ from ..contacts import Contacts
 from ..repair import repair
 from .blend import MARGIN, blend
 from .findings import Finding, kept_meshes
-from .follow import Follower
+from .follow import FollowedFrame, Follower
 from .mesh_groups import groups_of
 from .stretch import FollowedMesh, RepairedStretch, ShotFrame, StretchRecorder
 
@@ -233,7 +233,7 @@ class _Shot:
         frame, known = start, Contacts.none()
         for index in range(first, last):
             if index >= stop and not frame.differs:
-                return
+                break
             interval = self._scene.interval(index)
             given = self._single(interval.x1)
             if displacements is None:
@@ -244,6 +244,7 @@ class _Shot:
                 displacement = np.zeros_like(given)
                 if index - first + 1 < len(displacements):
                     displacement[used] = displacements[index - first + 1]
+            before = frame
             if self._findings[index].is_free and not frame.differs and not displacement.any():
                 frame, known = ShotFrame.of_shot(given), Contacts.none()
             else:
@@ -251,20 +252,32 @@ class _Shot:
                     known, tolerance = self._follower.near(known, frame.x), _SOUGHT
                 else:
                     known, tolerance = contacts.get(index, Contacts.none()), _ACCEPTED
-                found = self._follower.follow(
-                    frame.x,
-                    given,
-                    displacement,
-                    tolerance=tolerance,
-                    known=known,
-                    free_start=frame.given if self._findings[index].is_free and self._is_single else None,
-                    arcs=self._arcs(interval),
-                )
+                options = {"tolerance": tolerance, "known": known, "relaxes": displacements is not None}
+                found = self._follow_to(interval, frame, displacement, options)
+                if not found.certified and frame.unrelaxed is not None:
+                    again = self._follow_to(interval, unrelaxed := frame.before_relaxing(), displacement, options)
+                    if again.certified:
+                        before, found = unrelaxed, again
                 if displacements is None:
                     known = contacts[index] = found.contacts
                 added = found.displacement if displacements is None else found.x - given
-                frame = ShotFrame(given, found.x, added.astype(np.float32), found.certified)
+                frame = ShotFrame(given, found.x, added.astype(np.float32), found.certified, found.unrelaxed)
+            if index > first:
+                yield before
+        if frame is not start:
             yield frame
+
+    def _follow_to(self, interval, start: ShotFrame, displacement, options) -> FollowedFrame:
+        """Returns the positions at the end of an interval; ``options`` are those of :meth:`.Follower.follow`."""
+        is_free = self._findings[interval.index].is_free and self._is_single
+        return self._follower.follow(
+            start.x,
+            self._single(interval.x1),
+            displacement,
+            free_start=start.given if is_free else None,
+            arcs=self._arcs(interval),
+            **options,
+        )
 
     def _record(self, recorder, first, frame, number) -> None:
         """Adds the frame of a number, counted from that at the start of the first interval, to a stretch."""

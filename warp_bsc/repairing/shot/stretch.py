@@ -64,17 +64,24 @@ class ShotFrame:
         x: Positions that follow it, likewise.
         displacement: What was added to the shot before the last response, float32, likewise.
         certified: Whether the motion from the frame before is certified.
+        unrelaxed: Positions to which the motion is certified too, with more strain; None if there are none.
     """
 
     given: np.ndarray
     x: np.ndarray
     displacement: np.ndarray
     certified: bool = True
+    unrelaxed: np.ndarray | None = None
 
     @staticmethod
     def of_shot(given: np.ndarray) -> "ShotFrame":
         """Returns the frame that is as in the shot."""
         return ShotFrame(given, given, np.zeros_like(given))
+
+    def before_relaxing(self) -> "ShotFrame":
+        """Returns the frame with the positions before springs relaxed it, which it must have."""
+        assert self.unrelaxed is not None
+        return ShotFrame(self.given, self.unrelaxed, self.unrelaxed - self.given)
 
     @property
     def differs(self) -> bool:

@@ -76,6 +76,7 @@ class Instancer:
         times: Time codes at which transforms of its instances to the world have a sample.
         break_times: Time codes at which instances may appear or vanish.
         may_jump: Whether instances may jump at a time, see :func:`~warp_bsc.usd.read.samples.may_jump`.
+        may_turn: Whether its orientations, or those of an instancer around it, change.
     """
 
     count: int = 0
@@ -103,10 +104,12 @@ class Instancer:
             instancer.GetProtoIndicesAttr(), instancer.GetInvisibleIdsAttr(), instancer.GetIdsAttr()
         )
         self.may_jump: bool = may_jump([*transform_attributes(prim, root), *placing])
+        self.may_turn = any(attribute.ValueMightBeTimeVarying() for attribute in placing[1:3])
         if parent:
             self.times |= parent.instancer.times
             self.break_times |= parent.instancer.break_times
             self.may_jump |= parent.instancer.may_jump
+            self.may_turn |= parent.instancer.may_turn
 
     def transforms(self, prim: Usd.Prim, root: Usd.Prim, time: Usd.TimeCode) -> tuple[np.ndarray, np.ndarray]:
         """Returns the matrices that transform points of a prim of a prototype, as rows, to world space, by instance.

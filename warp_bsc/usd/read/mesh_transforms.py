@@ -9,6 +9,12 @@ from pxr import Usd, UsdGeom
 from .instancers import Instance, are_finite, masking_attributes, transform_attributes, transform_ops, transform_times
 from .samples import may_jump
 
+TRANSLATIONS = {
+    UsdGeom.XformOp.TypeTranslate,
+    UsdGeom.XformOp.TypeTranslateX,
+    UsdGeom.XformOp.TypeTranslateY,
+    UsdGeom.XformOp.TypeTranslateZ,
+}
 _BETWEEN = 0.382  # where between two samples transforms are tested for bends; halfway, two whole turns look like none
 _ROUNDING = 1e-6  # of transforms that USD interpolates in single precision
 
@@ -19,6 +25,7 @@ class MeshTransforms:
     Attributes:
         times: Time codes at which they have a sample, ascending.
         may_jump: Whether they may jump at a time.
+        may_turn: Whether anything but translations changes them.
         moves: Whether the transform of each instance ever changes, shape [count], one without an instancer.
         stays: Whether it is the identity when the instance first exists, likewise.
         is_finite: Whether it is finite then, likewise.
@@ -37,6 +44,9 @@ class MeshTransforms:
         instancer = instance.instancer if instance else None
         self.times = sorted(transform_times(frame, self._root) | (instancer.times if instancer else set()))
         self.may_jump = may_jump(transform_attributes(frame, self._root)) or bool(instancer and instancer.may_jump)
+        varying = (op.GetOpType() for op in self.ops(instance) if op.MightBeTimeVarying())
+        self.may_turn = any(kind not in TRANSLATIONS for kind in varying) or bool(instancer and instancer.may_turn)
+        self._cache = UsdGeom.XformCache()
         # Between samples as well, because a whole turn ends where it began.
         between = [start + _BETWEEN * (end - start) for start, end in pairwise(self.times)]
         codes = [Usd.TimeCode.EarliestTime(), *map(Usd.TimeCode, sorted([*self.times, *between]))]
@@ -60,7 +70,8 @@ class MeshTransforms:
         """Returns the result of :meth:`.Instancer.transforms`, or one matrix for a mesh without an instancer."""
         if instance:
             return instance.instancer.transforms(self._frame, instance.root, time)
-        return self.compute(UsdGeom.XformCache(time))[None], np.ones(1, dtype=bool)
+        self._cache.SetTime(time)
+        return self.compute(self._cache)[None], np.ones(1, dtype=bool)
 
     def read_one(self, instance: Instance | None, time: Usd.TimeCode) -> np.ndarray | None:
         """Returns the matrix of one instance, shape [4, 4]; None if it has none then."""
