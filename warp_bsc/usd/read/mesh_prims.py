@@ -2,6 +2,7 @@
 
 import os
 from collections import Counter
+from collections.abc import Iterator
 from functools import cached_property
 from typing import Any
 
@@ -66,6 +67,7 @@ class MeshPrimFinder:
         self._bindings: dict[Sdf.Path, Any] = {}  # by path; of a root, the error or None
         self._clips: dict[Sdf.Path, bool] = {}  # whether the value clips of a prim are left out
         self._with_clips: list[Sdf.Path] = []  # prims with others
+        self._prototypes: dict[Sdf.Path, list[tuple[Usd.Prim, str]]] = {}  # what was found in each, by its root
         self.found: list[MeshPrim] = []
         self.other: Counter[str] = Counter()
 
@@ -79,6 +81,21 @@ class MeshPrimFinder:
         Raises:
             UnreadableError: If a skeleton or an instancer is broken and may not be left out.
         """
+        found = self._sorted(prims, instance.root if instance else None)
+        if instance:  # all instances of a prototype have the same prims, and there may be many
+            path = instance.root.GetPath()
+            found = self._prototypes[path] = self._prototypes.get(path) or list(found)
+        for prim, other in found:
+            if prim.IsA(UsdGeom.PointInstancer):
+                for inner in find_instances(prim, instance, self._file, self._left_out):
+                    self.walk(inner.prims(), inner)
+            elif other:
+                self.other[other] += 1
+            else:
+                self.found.append(MeshPrim(prim, instance, self._bindings.get(prim.GetPath())))
+
+    def _sorted(self, prims, root) -> Iterator[tuple[Usd.Prim, str]]:
+        """Yields the instancers and the prims with a shape, and what those are called that are not read as meshes."""
         for prim in prims:
             if has_clips(prim):
                 # The prims of instances have other paths, and the clips of their prototype.
@@ -90,15 +107,14 @@ class MeshPrimFinder:
             if prim.IsA(UsdGeom.PointInstancer):
                 # Meshes below it are prototypes, which are not shown where they stand in the hierarchy.
                 prims.PruneChildren()
-                for inner in find_instances(prim, instance, self._file, self._left_out):
-                    self.walk(inner.prims(), inner)
+                yield prim, ""
             elif prim.IsA(UsdSkel.Root):
                 if not self._find_bindings(prim):
                     prims.PruneChildren()
             elif prim.IsA(UsdGeom.Mesh) or prim.IsA(UsdGeom.TetMesh) or is_shape(prim) or is_strands(prim):
-                self.found.append(MeshPrim(prim, instance, self._bindings.get(prim.GetPath())))
-            elif prim.IsA(UsdGeom.Gprim) and is_ever_shown(prim, instance.root if instance else None):
-                self.other[f"{prim.GetTypeName()}{' that are not linear' * prim.IsA(UsdGeom.BasisCurves)}"] += 1
+                yield prim, ""
+            elif prim.IsA(UsdGeom.Gprim) and is_ever_shown(prim, root):
+                yield prim, f"{prim.GetTypeName()}{' that are not linear' * prim.IsA(UsdGeom.BasisCurves)}"
 
     def has_clips(self, prim: Usd.Prim) -> bool:
         """Returns whether values of a prim may come from value clips that are not left out."""
