@@ -219,7 +219,7 @@ def test_sentence_says_what_was_not_checked(tmp_path):
     said = sentence_of(stage, "--ignore", "/World/Floor", "/World/Falling")
     assert said.startswith("Nothing collides, nothing intersects: 1 interval and 2 times of 2 meshes and 3 triangles ")
     assert said.endswith(
-        " Left out: 1 collision of ignored pairs. Only some pairs of meshes were checked, as options say."
+        " Not counted: 1 ignored pair of meshes, 1 collision. Only some pairs of meshes were checked, as options say."
     )
     said = sentence_of(stage, "--prims", "/World/Falling", "--no-intersections", "--method", "float")
     assert said == (

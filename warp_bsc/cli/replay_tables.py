@@ -83,10 +83,8 @@ def print_replay(console: Console, summary: Summary) -> None:
     if summary.clearance is not None:
         _print_proximities(console, summary, summary.clearance)
     if summary.ignored:
-        ignored = sum(hits for _, hits in summary.ignored)
-        say(console, f"Ignored: {count(ignored, 'colliding pair')} of {count(len(summary.ignored), 'pair')} of meshes.")
-        for meshes, hits in summary.ignored[:LONGEST]:
-            say(console, f"  {hits:,} of {_pair(meshes)}")
+        say(console, summary.not_counted)
+        say_list(console, [str(pair) for pair in summary.ignored], " pairs of meshes; --json has all.")
 
     if not scene.is_still:
         _print_certificate(console, summary)

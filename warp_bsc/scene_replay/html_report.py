@@ -252,10 +252,7 @@ class ReportPage(RecordFile):
         pairs = len({tuple(sorted(span.meshes)) for span in spans})
         if pairs > MAX_PAIRS:
             notes.append(f"The page has {MAX_PAIRS:,} of {pairs:,} pairs of meshes, those with the most collisions.")
-        if ignored := summary.ignored:
-            hits = sum(hits for _, hits in ignored)
-            notes.append(f"{hits:,} collisions of {len(ignored):,} ignored pairs of meshes are left out.")
-        return notes
+        return [*notes, summary.not_counted] if summary.not_counted else notes
 
 
 def _choose_rows(pairs: ScenePairs, most: int) -> np.ndarray:

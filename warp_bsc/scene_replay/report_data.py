@@ -149,11 +149,9 @@ def _nothing_found(summary: Summary) -> str:
     text += f", certified for {CERTIFIED_FOR}." if summary.certified else ", not certified: collisions may be missing."
     if not at_rest:
         text += " Intersections at rest were not checked."
-    if hits := sum(hits for _, hits in summary.ignored):
-        text += f" Left out: {hits:,} {_plural('collision', hits)} of ignored pairs."
+    text += f" {summary.not_counted}" if summary.not_counted else ""
     text += f" {summary.not_checked}" if summary.not_checked else ""
-    selection = scene.selection
-    if selection.between or selection.ignore or selection.ignored_names or not selection.self_collisions:
+    if scene.selection.chooses_pairs:
         text += " Only some pairs of meshes were checked, as options say."
     return text
 

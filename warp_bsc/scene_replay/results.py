@@ -53,6 +53,7 @@ class IntersectionSummary:
             that intersects itself.
         inside: Number of connected parts of a mesh that are wholly inside another mesh, by the name of the inner mesh
             and that of the outer one.
+        ignored: Number of edges that meet faces and are ignored, by the names of the two meshes, in the scene's order.
     """
 
     time: float
@@ -60,6 +61,7 @@ class IntersectionSummary:
     touches: int
     mesh_pairs: dict[tuple[str, str], tuple[int, int]]
     inside: dict[tuple[str, str], int]
+    ignored: dict[tuple[str, str], int]
 
     @property
     def is_empty(self) -> bool:
@@ -318,6 +320,7 @@ def summarize_intersections(found: SceneIntersections) -> IntersectionSummary:
         found.touches,
         {names: (a, b) for names, (a, b) in by_meshes.items()},
         dict(inside),
+        found.ignored,
     )
 
 

@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import TypeVar
 
 from ..usd.scene import Scene
+from ..usd.selection import Meant
 from .results import TOI_BINS, Contact, IntersectionSummary, IntervalSummary, Nearest, ProximitySummary
 from .validation import Validation
 
@@ -16,6 +17,30 @@ _AtRest = TypeVar("_AtRest", IntersectionSummary, ProximitySummary)
 
 CERTIFIED_FOR = "vertices that move straight or turn about one axis between the times checked"
 """The motion that a certificate holds for."""
+
+
+@dataclass(frozen=True)
+class IgnoredPair:
+    """Two meshes whose collisions and intersections are only counted.
+
+    Attributes:
+        meshes: Names of the two, sorted.
+        hits: Number of their pairs that collide.
+        edges: Largest number of edges of one that meet faces of the other at a time.
+        meant: The entry of the triage by which they are meant to meet; None if an option ignores them.
+    """
+
+    meshes: tuple[str, str]
+    hits: int
+    edges: int
+    meant: Meant | None
+
+    def __str__(self) -> str:
+        """Returns the numbers, the meshes and the reason, in words."""
+        first, second = self.meshes
+        edges = f", at most {self.edges:,} edges in faces" * bool(self.edges)
+        reason = f": {self.meant}" if self.meant else ""
+        return f"{self.hits:,} of {first} with {'itself' if first == second else second}{edges}{reason}"
 
 
 @dataclass(frozen=True)
@@ -199,9 +224,19 @@ class Summary:
         return sum(interval.hits for interval in self.intervals)
 
     @cached_property
-    def ignored(self) -> list[tuple[tuple[str, str], int]]:
-        """Names of two meshes and their number of colliding pairs that were ignored, the largest first."""
-        return self._largest("ignored")
+    def ignored(self) -> list[IgnoredPair]:
+        """The pairs of meshes that meet and are ignored, those with the most collisions first."""
+        hits, edges = Counter[tuple[str, str]](), Counter[tuple[str, str]]()
+        for interval in self.intervals:
+            hits.update({(min(meshes), max(meshes)): number for meshes, number in interval.ignored.items()})
+        for sample in self.intersections:
+            edges |= Counter({(min(meshes), max(meshes)): number for meshes, number in sample.ignored.items()})
+        selection, prim_of = self.scene.selection, self.scene.prim_of
+        pairs = (
+            IgnoredPair(meshes, hits[meshes], edges[meshes], selection.meant(*map(prim_of, meshes)))
+            for meshes in hits.keys() | edges.keys()
+        )
+        return sorted(pairs, key=lambda pair: (-pair.hits, -pair.edges, pair.meshes))
 
     @cached_property
     def collision_spans(self) -> list[CollisionSpan]:
@@ -305,20 +340,16 @@ class Summary:
     @cached_property
     def mesh_pairs(self) -> list[tuple[tuple[str, str], int]]:
         """Names of two meshes and their number of colliding pairs, the largest first."""
-        return self._largest("mesh_pairs")
+        total: Counter[tuple[str, str]] = Counter()
+        for interval in self.intervals:
+            total.update(interval.mesh_pairs)
+        return total.most_common()
 
     @property
     def toi_counts(self) -> list[int]:
         """Number of pairs by their time of impact, in equal parts of an interval."""
         counts = [interval.toi_counts for interval in self.intervals]
         return [sum(column) for column in zip(*counts, strict=True)] or [0] * TOI_BINS
-
-    def _largest(self, counts: str) -> list[tuple[tuple[str, str], int]]:
-        """Returns counts by two meshes of all intervals, the largest first."""
-        total: Counter[tuple[str, str]] = Counter()
-        for interval in self.intervals:
-            total.update(getattr(interval, counts))
-        return total.most_common()
 
     @property
     def validation(self) -> Validation | None:
@@ -352,6 +383,16 @@ class Summary:
         return text
 
     @property
+    def not_counted(self) -> str:
+        """A sentence on the pairs of meshes that are meant to meet, or ignored; empty without any."""
+        if not self.ignored:
+            return ""
+        meant, hits = sum(pair.meant is not None for pair in self.ignored), sum(pair.hits for pair in self.ignored)
+        kinds = [(meant, "meant"), (len(self.ignored) - meant, "ignored")]
+        pairs = " and ".join(_count(number, f"{kind} pair") for number, kind in kinds if number)
+        return f"Not counted: {pairs} of meshes, {_count(hits, 'collision')}."
+
+    @property
     def not_checked(self) -> str:
         """A sentence on the parts of the scene that are left out; empty if there are none."""
         parts = len(self.scene.left_out)
@@ -369,6 +410,10 @@ def _at_all_times(intervals: Iterable[tuple[_AtRest, _AtRest] | None]) -> list[_
     """Returns what is at the starts of intervals, and at the end of the last one."""
     found = [both for both in intervals if both]
     return [start for start, _ in found] + [end for _, end in found[-1:] if end.time != found[-1][0].time]
+
+
+def _count(number: int, one: str) -> str:
+    return f"{number:,} {one}{'s' * (number != 1)}"
 
 
 def _when(span: DuplicateSpan | InversionSpan) -> str:
