@@ -1,11 +1,12 @@
-"""The data of a replay's page beside its blocks: title, numbers, charts, pairs of meshes, facts."""
+"""What a replay says of a whole scene: whether it is broken, by which pairs of meshes, and the data of its page."""
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
 from ..usd.scene import Scene
 from .baseline import Baseline, NewFinding
-from .summary import CERTIFIED_FOR, Summary
+from .summary import CERTIFIED_FOR, CollisionSpan, IntersectionSpan, Summary
 
 MAX_PAIRS = 10_000
 """Largest number of pairs of meshes in the page."""
@@ -14,21 +15,104 @@ _MAX_ROWS = 10  # of the small tables
 _MAX_DISAGREEMENTS = 200
 _MAX_NAMES = 100  # of duplicates
 
-Depths = dict[tuple[str, str], tuple[float, float]]
-"""The largest depth of two meshes and its time, by their sorted names."""
-
 
 def report_title(scene: Scene) -> str:
     """Returns the title of the page."""
     return f"Collisions in {Path(scene.path).name}"
 
 
-def report_data(summary: Summary, depths: Depths, baseline: Baseline | None) -> dict:
+@dataclass(frozen=True)
+class PairFindings:
+    """Two meshes that collide or intersect at some time of a replay, or one that does so with itself.
+
+    Attributes:
+        meshes: Names of the two, sorted.
+        since: The first time at which they do, as a time code.
+        until: The last time.
+        is_initial: Whether they intersect at the first time already.
+        hits: Number of their pairs that collide.
+        edges: Largest number of edges of one that meet faces of the other at a time.
+        depth: The largest depth, in the scene's unit of length, and the first time with it; None if it is not known.
+    """
+
+    meshes: tuple[str, str]
+    since: float
+    until: float
+    is_initial: bool
+    hits: int
+    edges: int
+    depth: tuple[float, float] | None
+
+
+def pairs_of_meshes(summary: Summary) -> list[PairFindings]:
+    """Returns the pairs of meshes that collide or intersect, those that begin after the first time before the others.
+
+    Among these, the deepest come first, then those with the most collisions.
+    """
+    hits = {(min(meshes), max(meshes)): number for meshes, number in summary.mesh_pairs}
+    spans: dict[tuple[str, str], list[CollisionSpan | IntersectionSpan]] = {}
+    for span in (*summary.collision_spans, *summary.intersection_spans):
+        spans.setdefault((min(span.meshes), max(span.meshes)), []).append(span)
+    first = summary.intersections[0] if summary.intersections else None
+    initial = {(min(meshes), max(meshes)) for meshes in (*first.mesh_pairs, *first.inside)} if first else set()
+    pairs = [
+        PairFindings(
+            meshes,
+            since=min(span.since for span in own),
+            until=max(span.until for span in own),
+            is_initial=meshes in initial,
+            hits=hits.get(meshes, 0),
+            edges=max((span.most for span in own if isinstance(span, IntersectionSpan) and not span.inside), default=0),
+            depth=summary.depths.get(meshes),
+        )
+        for meshes, own in spans.items()
+    ]
+    return sorted(pairs, key=lambda pair: (pair.is_initial, -(pair.depth or (0,))[0], -pair.hits, pair.meshes))
+
+
+def length(scene: Scene, distance: float) -> str:
+    """Returns a distance in centimetres, by the scene's unit of length; of mesh files, which have none, as it is."""
+    return f"{distance:.3g}" if scene.stage is None else f"{100.0 * distance * scene.meters_per_unit:.3g} cm"
+
+
+def verdict(summary: Summary) -> str:
+    """Returns a sentence that says whether a scene is broken, by how many pairs of meshes, and which is the worst."""
+    if sentence := _nothing_found(summary):
+        return sentence
+    pairs, scene = pairs_of_meshes(summary), summary.scene
+    later = sum(not pair.is_initial for pair in pairs)
+    inverting = len({span.meshes for span in summary.inversion_spans})
+    same = len({name for span in summary.duplicate_spans for name in span.meshes})
+    verb = "collides or intersects" if len(pairs) == 1 else "collide or intersect"
+    parts = [f"{len(pairs):,} {_plural('pair', len(pairs))} of meshes {verb}"] * bool(pairs)
+    if later < len(pairs):
+        parts[0] += f", {later:,} of them only after the first time" if later else ", at the first time already"
+    parts += [f"tetrahedra of {inverting:,} {_plural('mesh', inverting, 'es')} invert"] * bool(inverting)
+    is_broken = bool(parts)
+    parts += [f"{same:,} meshes are duplicates"] * bool(same)
+    if near := len(summary.nearest):
+        parts.append(f"{near:,} {_plural('pair', near)} of meshes are within {summary.clearance:g} of each other")
+    if not parts:
+        return ""  # nothing was checked, or not all of it
+    text = f"{'Broken' if is_broken else 'Not broken, but'}: {'; '.join(parts)}."
+    if pairs:
+        (first, second), worst = pairs[0].meshes, pairs[0]
+        deep = (
+            f"{length(scene, worst.depth[0])} deep"
+            if worst.depth and worst.depth[0]
+            else f"{worst.hits:,} {_plural('collision', worst.hits)}"
+        )
+        when = f"time {worst.since:g}" + f" to {worst.until:g}" * (worst.until > worst.since)
+        of_these = " of these" * (0 < later < len(pairs))
+        text += f" The worst{of_these}: {first} with {'itself' if first == second else second}, {deep}, {when}."
+    return text
+
+
+def report_data(summary: Summary, baseline: Baseline | None) -> dict:
     """Returns the data of the whole replay that the page's script shows.
 
     Args:
         summary: The replay.
-        depths: The depth of each two meshes that intersect.
         baseline: The earlier replay with which the page compares; None without one.
     """
     new = None if baseline is None else baseline.new_in(summary)
@@ -49,8 +133,8 @@ def report_data(summary: Summary, depths: Depths, baseline: Baseline | None) -> 
         tiles.append((f"{len({name for span in spans for name in span.meshes}):,}", "meshes that are duplicates"))
     if inversions := summary.inversion_spans:
         tiles.append((f"{len({span.meshes for span in inversions}):,}", "meshes with inverted tetrahedra"))
-    if depths:
-        tiles.append((f"{max(depth for depth, _ in depths.values()):.4g}", "largest depth"))
+    if depths := summary.depths:
+        tiles.append((length(scene, max(depth for depth, _ in depths.values())), "largest depth"))
     if summary.clearance is not None:
         nearest = summary.nearest
         tiles.append((f"{nearest[0].distance:.4g}" if nearest else f"> {summary.clearance:g}", "smallest distance"))
@@ -65,6 +149,7 @@ def report_data(summary: Summary, depths: Depths, baseline: Baseline | None) -> 
         f"{summary.device}",
         "partial": "",
         "nothing": _nothing_found(summary),
+        "verdict": verdict(summary),
         "is_whole": not summary.not_checked,
         "tiles": tiles,
         "intervals": [
@@ -80,7 +165,8 @@ def report_data(summary: Summary, depths: Depths, baseline: Baseline | None) -> 
         "rest": [(at.time, at.crossings, at.touches, sum(at.inside.values())) for at in summary.intersections],
         "near": [(at.time, at.pairs) for at in summary.proximities],
         "toi": summary.toi_counts,
-        "pairs": _pairs_of_meshes(summary, depths, new or ()),
+        "pairs": _pairs_of_meshes(summary, new or ()),
+        "centimetres": None if scene.stage is None else 100.0 * scene.meters_per_unit,
         "has_baseline": new is not None,
         "up_axis": scene.up_axis,
         "facts": [
@@ -135,6 +221,7 @@ def _nothing_found(summary: Summary) -> str:
         return ""  # nothing was checked
     scene, at_rest = summary.scene, len(summary.intersections)
     what = ["Nothing collides"] * (not scene.is_still) + ["nothing intersects"] * bool(at_rest)
+    what += ["no tetrahedron inverts"] * any(scene.prim_of(name).has_tetrahedra for name in scene.names)
     if summary.clearance is not None:
         what.append(f"nothing is within {summary.clearance:g} of another")
     times = f"time {scene.times[0]:g}" if scene.is_still else f"time {scene.times[0]:g} to {scene.times[-1]:g}"
@@ -160,15 +247,14 @@ def _plural(word: str, count: int, ending: str = "s") -> str:
     return word if count == 1 else word + ending
 
 
-def _pairs_of_meshes(summary: Summary, depths: Depths, new: Iterable[NewFinding]) -> list[dict]:
+def _pairs_of_meshes(summary: Summary, new: Iterable[NewFinding]) -> list[dict]:
     """Returns the pairs of meshes with collisions, intersections or proximities, and the spans of time of each kind.
 
     ``new`` is what a baseline does not contain.
 
-    The deepest come first, then those with the most collisions. A pair has at most :data:`_MAX_ROWS` spans of each
-    kind; the numbers ``more`` count the others.
+    They come in the order of :func:`pairs_of_meshes`, then those with proximities alone. A pair has at most
+    :data:`_MAX_ROWS` spans of each kind; the numbers ``more`` count the others.
     """
-    hits = {(min(meshes), max(meshes)): count for meshes, count in summary.mesh_pairs}
     spans: dict[tuple[str, str], tuple[tuple[str, str], list, list, list]] = {}
 
     def spans_of(meshes: tuple[str, str]) -> tuple[tuple[str, str], list, list, list]:
@@ -184,18 +270,18 @@ def _pairs_of_meshes(summary: Summary, depths: Depths, new: Iterable[NewFinding]
     new_of: dict[tuple[str, str], list[tuple[str, float, float]]] = {}
     for what, meshes, start, end in new:
         new_of.setdefault((min(meshes), max(meshes)), []).append((what, start, end))
-    order = sorted(spans, key=lambda key: (-depths.get(key, (0.0, 0.0))[0], -hits.get(key, 0)))
-    return [_pair(spans[key], hits.get(key, 0), depths.get(key), new_of.get(key, [])) for key in order[:MAX_PAIRS]]
+    found = {pair.meshes: pair for pair in pairs_of_meshes(summary)}
+    order = [*found, *(meshes for meshes in spans if meshes not in found)]
+    return [_pair(spans[key], found.get(key), new_of.get(key, [])) for key in order[:MAX_PAIRS]]
 
 
-def _pair(
-    spans: tuple[tuple[str, str], list, list, list], hits: int, depth: tuple[float, float] | None, new: list
-) -> dict:
+def _pair(spans: tuple[tuple[str, str], list, list, list], found: PairFindings | None, new: list) -> dict:
     meshes, collisions, at_rest, near = spans
     return {
         "meshes": meshes,
-        "hits": hits,
-        "depth": depth,
+        "hits": found.hits if found else 0,
+        "depth": found.depth if found else None,
+        "is_initial": found is not None and found.is_initial,
         "spans": collisions[:_MAX_ROWS],
         "more": max(0, len(collisions) - _MAX_ROWS),
         "rest": at_rest[:_MAX_ROWS],

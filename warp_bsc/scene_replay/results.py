@@ -9,6 +9,7 @@ from ..detection.inversions import Inversions
 from ..detection.results.collisions import DetectionStats, PhaseCounts
 from ..detection.run.settings import DistanceKind
 from ..usd.interval import Interval
+from ..usd.selection import Meant
 from .scene_contacts import SceneContacts
 from .scene_intersections import SceneIntersections
 from .scene_pairs import KINDS, PHASES, count_by_meshes
@@ -67,6 +68,30 @@ class IntersectionSummary:
     def is_empty(self) -> bool:
         """Whether nothing intersects."""
         return not self.mesh_pairs and not self.inside
+
+
+@dataclass(frozen=True)
+class IgnoredPair:
+    """Two meshes whose collisions and intersections are only counted.
+
+    Attributes:
+        meshes: Names of the two, sorted.
+        hits: Number of their pairs that collide.
+        edges: Largest number of edges of one that meet faces of the other at a time.
+        meant: The entry of the triage by which they are meant to meet; None if an option ignores them.
+    """
+
+    meshes: tuple[str, str]
+    hits: int
+    edges: int
+    meant: Meant | None
+
+    def __str__(self) -> str:
+        """Returns the numbers, the meshes and the reason, in words."""
+        first, second = self.meshes
+        edges = f", at most {self.edges:,} edges in faces" * bool(self.edges)
+        reason = f": {self.meant}" if self.meant else ""
+        return f"{self.hits:,} of {first} with {'itself' if first == second else second}{edges}{reason}"
 
 
 @dataclass(frozen=True)

@@ -2,14 +2,13 @@
 
 import functools
 from collections import Counter
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TypeVar
 
 from ..usd.scene import Scene
-from ..usd.selection import Meant
-from .results import TOI_BINS, Contact, IntersectionSummary, IntervalSummary, Nearest, ProximitySummary
+from .results import TOI_BINS, Contact, IgnoredPair, IntersectionSummary, IntervalSummary, Nearest, ProximitySummary
 from .validation import Validation
 
 _Span = TypeVar("_Span")
@@ -17,30 +16,6 @@ _AtRest = TypeVar("_AtRest", IntersectionSummary, ProximitySummary)
 
 CERTIFIED_FOR = "vertices that move straight or turn about one axis between the times checked"
 """The motion that a certificate holds for."""
-
-
-@dataclass(frozen=True)
-class IgnoredPair:
-    """Two meshes whose collisions and intersections are only counted.
-
-    Attributes:
-        meshes: Names of the two, sorted.
-        hits: Number of their pairs that collide.
-        edges: Largest number of edges of one that meet faces of the other at a time.
-        meant: The entry of the triage by which they are meant to meet; None if an option ignores them.
-    """
-
-    meshes: tuple[str, str]
-    hits: int
-    edges: int
-    meant: Meant | None
-
-    def __str__(self) -> str:
-        """Returns the numbers, the meshes and the reason, in words."""
-        first, second = self.meshes
-        edges = f", at most {self.edges:,} edges in faces" * bool(self.edges)
-        reason = f": {self.meant}" if self.meant else ""
-        return f"{self.hits:,} of {first} with {'itself' if first == second else second}{edges}{reason}"
 
 
 @dataclass(frozen=True)
@@ -183,6 +158,8 @@ class Summary:
         clearance: Distance up to which proximities were found, in the scene's unit of length; None without them.
         limit: Largest number of rows of each list of an interval in files, see :mod:`~warp_bsc.scene_replay.limit`;
             None if files list all.
+        depths: The largest depth of each two meshes that intersect, in the scene's unit of length, and the first time
+            with it, by their sorted names; empty if depths were not measured.
     """
 
     scene: Scene
@@ -192,6 +169,7 @@ class Summary:
     stopped: str = ""
     clearance: float | None = None
     limit: int | None = None
+    depths: Mapping[tuple[str, str], tuple[float, float]] = field(default_factory=dict)
 
     @property
     def is_complete(self) -> bool:

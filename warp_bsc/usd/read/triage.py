@@ -60,7 +60,7 @@ def read_triage(path: str | os.PathLike) -> tuple[Meant, ...]:
     """Returns the entries of a triage file, for the attribute ``triage`` of :class:`warp_bsc.Selection`.
 
     Args:
-        path: The file; :mod:`warp_bsc.usd.read.triage` describes it.
+        path: The file, as the page on replays describes it.
 
     Raises:
         OSError: If it cannot be read.
