@@ -29,7 +29,7 @@ _COLUMNS = ("first", "second", "elements", "first_0", "first_1", "second_0", "se
 
 _SCRIPTS = (
     "blocks.js", "rows.js", "elements.js", "table.js", "meshes.js", "view3d.js", "shaders.js", "view_data.js",
-    "cameras.js", "viewer.js", "timeline.js", "findings.js", "page.js",
+    "cameras.js", "viewer.js", "timeline.js", "findings.js", "meant.js", "page.js",
 )  # fmt: skip
 
 _WHY_NO_CAMERA = f"their views are not valid, or there are more than {_MOST_CAMERAS}"

@@ -1,7 +1,7 @@
 """What a replay says of a whole scene: whether it is broken, by which pairs of meshes, and the data of its page."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from ..usd.scene import Scene
@@ -166,6 +166,7 @@ def report_data(summary: Summary, baseline: Baseline | None) -> dict:
         "near": [(at.time, at.pairs) for at in summary.proximities],
         "toi": summary.toi_counts,
         "pairs": _pairs_of_meshes(summary, new or ()),
+        **_triage(summary),
         "centimetres": None if scene.stage is None else 100.0 * scene.meters_per_unit,
         "has_baseline": new is not None,
         "up_axis": scene.up_axis,
@@ -205,6 +206,20 @@ def report_data(summary: Summary, baseline: Baseline | None) -> dict:
         )
         data["validation"] = {"text": text, "disagreements": found.disagreements[:_MAX_DISAGREEMENTS]}
     return data
+
+
+def _triage(summary: Summary) -> dict:
+    """Returns what is meant to meet, and what is ignored: entries with their numbers of collisions, and both sums."""
+    scene, ignored = summary.scene, summary.ignored
+    hits = [sum(pair.hits for pair in ignored if pair.meant == entry) for entry in scene.selection.triage]
+    entries = [asdict(entry) | {"hits": number} for entry, number in zip(scene.selection.triage, hits, strict=True)]
+    others = [pair for pair in ignored if pair.meant is None]
+    return {
+        "triage": None if scene.stage is None else entries,
+        "triage_name": f"{Path(scene.path).stem}.triage.json",
+        "ignored": [{"meshes": pair.meshes, "hits": pair.hits, "reason": "ignored by an option"} for pair in others],
+        "ignored_counts": (len(ignored), sum(pair.hits for pair in ignored)),
+    }
 
 
 def _nothing_found(summary: Summary) -> str:
