@@ -232,7 +232,7 @@ def test_near_and_inside_in_chromium(near_and_inside, tmp_path, browser):
     kinds = "[...document.querySelectorAll('#rows tr[data-at] td.kind')].map((cell) => cell.textContent)"
     # in order of time, what is there from the start after what begins later
     assert browser.value(kinds) == ["proximity", "proximity", "inside", "inside", "inside"]
-    browser.click("#rows tr[data-at]", 4)
+    browser.click("#rows tr[data-at]", 1)
     browser.wait("!document.getElementById('selected').hidden")
     assert browser.value("document.getElementById('selected').textContent").startswith("proximity at time 2: ")
     assert "0.125 apart" in browser.value("document.getElementById('rows').textContent")
