@@ -73,7 +73,7 @@ def test_page_has_every_interval_with_hits(stage, tmp_path):
     assert data["rows"] == [[0, 0, 0], [0, 0, 0], [1, 0, 0], *at_rest] and data["near"] == []
     assert sum(data["toi"]) == 1 and data["toi"][9] + data["toi"][10] == 1
     (pair,) = data["pairs"]
-    assert (pair["meshes"], pair["hits"]) == (["/World/Floor", "/World/Falling"], 1)
+    assert (pair["meshes"], pair["hits"]) == (["/World/Falling", "/World/Floor"], 1)
     assert pair["spans"] == [[2, 3, 1]] and pair["rest"] == [[3, 4, data["rest"][3][1], "stays", ""]]
     assert data["up_axis"] == "Z" and data["validation"]["disagreements"] == []
     assert page.blocks == {"view-0", "faces-0", "hits-2", "view-2", "rest-3", "view-3", "rest-4"}

@@ -93,7 +93,7 @@ def test_a_clean_scene_names_what_was_checked(tmp_path, capsys):
     assert said.startswith("Nothing collides, nothing intersects: 1 interval and 2 times of 2 meshes")
     assert "tetrahedron" not in said
     near = verdict(capsys, stage, "--clearance", "2")
-    assert near == "Not broken, but: 1 pair of meshes are within 2 of each other."
+    assert near == "Not broken, but: within 2 of each other: 1 pair of meshes."
 
 
 def test_tetrahedra_that_invert(tmp_path, capsys):

@@ -13,6 +13,7 @@ from ..scene_replay.results import Contact, IntersectionSummary, IntervalSummary
 from ..scene_replay.scene_pairs import PHASES
 from ..scene_replay.summary import CERTIFIED_FOR, IntersectionSpan, Summary
 from ..scene_replay.validation import Validation
+from ..usd.scene import Scene
 from .option_names import with_option
 from .tables import print_table, say, say_list
 
@@ -58,7 +59,7 @@ def print_replay(console: Console, summary: Summary) -> None:
     if sentence := verdict(summary):
         say(console, sentence, style="bold red" if sentence.startswith("Broken") else "bold")
     pairs = pairs_of_meshes(summary)
-    _print_pairs(console, summary, pairs)
+    _print_pairs(console, scene, pairs)
 
     if summary.colliding:
         _print_collisions(console, summary)
@@ -181,19 +182,18 @@ def _print_certificate(console: Console, summary: Summary) -> None:
         say(console, f"Certified for {CERTIFIED_FOR}: every pair tested.")
 
 
-def _print_pairs(console: Console, summary: Summary, pairs: list[PairFindings]) -> None:
+def _print_pairs(console: Console, scene: Scene, pairs: list[PairFindings]) -> None:
     """Prints a line for each pair of meshes: its depth, and the times and numbers of what meets."""
-    spans = defaultdict(list)
-    for span in summary.collision_spans:
-        spans[min(span.meshes), max(span.meshes)].append(f"{span.since:g} to {span.until:g}")
     lines = []
     for pair in pairs:
-        parts = [f"{length(summary.scene, pair.depth[0])} deep at {pair.depth[1]:g}"] if pair.depth else []
-        if ranges := spans[pair.meshes]:
+        parts = [f"{length(scene, pair.depth[0])} deep at {pair.depth[1]:g}"] if pair.depth else []
+        if ranges := [f"{span.since:g} to {span.until:g}" for span in pair.collisions]:
             more = f", and {len(ranges) - _RANGES} more times" * (len(ranges) > _RANGES)
             parts.append(f"{count(pair.hits, 'collision')} from {', '.join(ranges[:_RANGES])}{more}")
         parts += [f"at most {count(pair.edges, 'edge')} in faces"] * bool(pair.edges)
-        lines.append(f"{_pair(pair.meshes)}: {'; '.join(parts)}{'; from the first time on' * pair.is_initial}")
+        if parts:
+            parts += ["from the first time on"] * pair.is_initial
+            lines.append(f"{_pair(pair.meshes)}: {'; '.join(parts)}")
     say_list(console, lines, " pairs of meshes; --json has all.")
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from ..usd.scene import Scene
 from .baseline import Baseline, NewFinding
-from .summary import CERTIFIED_FOR, CollisionSpan, IntersectionSpan, Summary
+from .summary import CERTIFIED_FOR, CollisionSpan, IntersectionSpan, ProximitySpan, Summary
 
 MAX_PAIRS = 10_000
 """Largest number of pairs of meshes in the page."""
@@ -23,51 +23,55 @@ def report_title(scene: Scene) -> str:
 
 @dataclass(frozen=True)
 class PairFindings:
-    """Two meshes that collide or intersect at some time of a replay, or one that does so with itself.
+    """Two meshes that collide, intersect or are near each other at some time of a replay, or one that does so itself.
 
     Attributes:
         meshes: Names of the two, sorted.
-        since: The first time at which they do, as a time code.
-        until: The last time.
+        collisions: The times over which they collide.
+        intersections: The times over which they intersect.
+        proximities: The times over which they are near each other.
         is_initial: Whether they intersect at the first time already.
-        hits: Number of their pairs that collide.
-        edges: Largest number of edges of one that meet faces of the other at a time.
         depth: The largest depth, in the scene's unit of length, and the first time with it; None if it is not known.
     """
 
     meshes: tuple[str, str]
-    since: float
-    until: float
+    collisions: list[CollisionSpan]
+    intersections: list[IntersectionSpan]
+    proximities: list[ProximitySpan]
     is_initial: bool
-    hits: int
-    edges: int
     depth: tuple[float, float] | None
+
+    @property
+    def hits(self) -> int:
+        """Number of their pairs that collide."""
+        return sum(span.hits for span in self.collisions)
+
+    @property
+    def edges(self) -> int:
+        """Largest number of edges of one that meet faces of the other at a time."""
+        return max((span.most for span in self.intersections if not span.inside), default=0)
 
 
 def pairs_of_meshes(summary: Summary) -> list[PairFindings]:
-    """Returns the pairs of meshes that collide or intersect, those that begin after the first time before the others.
+    """Returns the pairs of meshes that collide, intersect or are near each other.
 
-    Among these, the deepest come first, then those with the most collisions.
+    First come those that begin after the first time, then those that intersect at the first time already, then those
+    that are only near each other; in each the deepest first, then those with the most collisions.
     """
-    hits = {(min(meshes), max(meshes)): number for meshes, number in summary.mesh_pairs}
-    spans: dict[tuple[str, str], list[CollisionSpan | IntersectionSpan]] = {}
-    for span in (*summary.collision_spans, *summary.intersection_spans):
-        spans.setdefault((min(span.meshes), max(span.meshes)), []).append(span)
+    spans: dict[tuple[str, str], tuple[list, list, list]] = {}
+    found = summary.collision_spans, summary.intersection_spans, summary.proximity_spans
+    for which, own in enumerate(found):
+        for span in own:
+            spans.setdefault((min(span.meshes), max(span.meshes)), ([], [], []))[which].append(span)
     first = summary.intersections[0] if summary.intersections else None
     initial = {(min(meshes), max(meshes)) for meshes in (*first.mesh_pairs, *first.inside)} if first else set()
-    pairs = [
-        PairFindings(
-            meshes,
-            since=min(span.since for span in own),
-            until=max(span.until for span in own),
-            is_initial=meshes in initial,
-            hits=hits.get(meshes, 0),
-            edges=max((span.most for span in own if isinstance(span, IntersectionSpan) and not span.inside), default=0),
-            depth=summary.depths.get(meshes),
-        )
-        for meshes, own in spans.items()
-    ]
-    return sorted(pairs, key=lambda pair: (pair.is_initial, -(pair.depth or (0,))[0], -pair.hits, pair.meshes))
+    pairs = [PairFindings(key, *own, key in initial, summary.depths.get(key)) for key, own in spans.items()]
+
+    def rank(pair: PairFindings) -> tuple:
+        is_only_near = not pair.collisions and not pair.intersections
+        return is_only_near, pair.is_initial, -(pair.depth or (0.0,))[0], -pair.hits, pair.meshes
+
+    return sorted(pairs, key=rank)
 
 
 def length(scene: Scene, distance: float) -> str:
@@ -79,7 +83,7 @@ def verdict(summary: Summary) -> str:
     """Returns a sentence that says whether a scene is broken, by how many pairs of meshes, and which is the worst."""
     if sentence := _nothing_found(summary):
         return sentence
-    pairs, scene = pairs_of_meshes(summary), summary.scene
+    pairs = [pair for pair in pairs_of_meshes(summary) if pair.collisions or pair.intersections]
     later = sum(not pair.is_initial for pair in pairs)
     inverting = len({span.meshes for span in summary.inversion_spans})
     same = len({name for span in summary.duplicate_spans for name in span.meshes})
@@ -91,18 +95,17 @@ def verdict(summary: Summary) -> str:
     is_broken = bool(parts)
     parts += [f"{same:,} meshes are duplicates"] * bool(same)
     if near := len(summary.nearest):
-        parts.append(f"{near:,} {_plural('pair', near)} of meshes are within {summary.clearance:g} of each other")
+        parts.append(f"within {summary.clearance:g} of each other: {near:,} {_plural('pair', near)} of meshes")
     if not parts:
         return ""  # nothing was checked, or not all of it
     text = f"{'Broken' if is_broken else 'Not broken, but'}: {'; '.join(parts)}."
     if pairs:
         (first, second), worst = pairs[0].meshes, pairs[0]
-        deep = (
-            f"{length(scene, worst.depth[0])} deep"
-            if worst.depth and worst.depth[0]
-            else f"{worst.hits:,} {_plural('collision', worst.hits)}"
-        )
-        when = f"time {worst.since:g}" + f" to {worst.until:g}" * (worst.until > worst.since)
+        depth, spans = worst.depth[0] if worst.depth else 0.0, [*worst.collisions, *worst.intersections]
+        hits = f"{worst.hits:,} {_plural('collision', worst.hits)}"
+        since, until = min(span.since for span in spans), max(span.until for span in spans)
+        deep, when = f"{length(summary.scene, depth)} deep" if depth else hits, f"time {since:g}"
+        when += f" to {until:g}" * (until > since)
         of_these = " of these" * (0 < later < len(pairs))
         text += f" The worst{of_these}: {first} with {'itself' if first == second else second}, {deep}, {when}."
     return text
@@ -263,46 +266,27 @@ def _plural(word: str, count: int, ending: str = "s") -> str:
 
 
 def _pairs_of_meshes(summary: Summary, new: Iterable[NewFinding]) -> list[dict]:
-    """Returns the pairs of meshes with collisions, intersections or proximities, and the spans of time of each kind.
+    """Returns :func:`pairs_of_meshes` with the spans of time of each kind, for the page.
 
-    ``new`` is what a baseline does not contain.
-
-    They come in the order of :func:`pairs_of_meshes`, then those with proximities alone. A pair has at most
-    :data:`_MAX_ROWS` spans of each kind; the numbers ``more`` count the others.
+    A pair has at most :data:`_MAX_ROWS` spans of each kind; the numbers ``more`` count the others. ``new`` is what a
+    baseline does not contain.
     """
-    spans: dict[tuple[str, str], tuple[tuple[str, str], list, list, list]] = {}
-
-    def spans_of(meshes: tuple[str, str]) -> tuple[tuple[str, str], list, list, list]:
-        return spans.setdefault((min(meshes), max(meshes)), (meshes, [], [], []))
-
-    for span in summary.collision_spans:
-        spans_of(span.meshes)[1].append((span.since, span.until, span.hits))
-    for span in summary.intersection_spans:
-        inner = span.meshes[0] if span.inside else ""
-        spans_of(span.meshes)[2].append((span.since, span.until, span.most, span.trend, inner))
-    for span in summary.proximity_spans:
-        spans_of(span.meshes)[3].append((span.since, span.until, span.distance))
     new_of: dict[tuple[str, str], list[tuple[str, float, float]]] = {}
     for what, meshes, start, end in new:
         new_of.setdefault((min(meshes), max(meshes)), []).append((what, start, end))
-    found = {pair.meshes: pair for pair in pairs_of_meshes(summary)}
-    order = [*found, *(meshes for meshes in spans if meshes not in found)]
-    return [_pair(spans[key], found.get(key), new_of.get(key, [])) for key in order[:MAX_PAIRS]]
+    return [_pair(pair, new_of.get(pair.meshes, [])) for pair in pairs_of_meshes(summary)[:MAX_PAIRS]]
 
 
-def _pair(spans: tuple[tuple[str, str], list, list, list], found: PairFindings | None, new: list) -> dict:
-    meshes, collisions, at_rest, near = spans
-    return {
-        "meshes": meshes,
-        "hits": found.hits if found else 0,
-        "depth": found.depth if found else None,
-        "is_initial": found is not None and found.is_initial,
-        "spans": collisions[:_MAX_ROWS],
-        "more": max(0, len(collisions) - _MAX_ROWS),
-        "rest": at_rest[:_MAX_ROWS],
-        "more_rest": max(0, len(at_rest) - _MAX_ROWS),
-        "near": near[:_MAX_ROWS],
-        "more_near": max(0, len(near) - _MAX_ROWS),
-        "new": new[:_MAX_ROWS],
-        "more_new": max(0, len(new) - _MAX_ROWS),
+def _pair(pair: PairFindings, new: list) -> dict:
+    lists = {
+        "spans": [(span.since, span.until, span.hits) for span in pair.collisions],
+        "rest": [
+            (span.since, span.until, span.most, span.trend, span.meshes[0] if span.inside else "")
+            for span in pair.intersections
+        ],
+        "near": [(span.since, span.until, span.distance) for span in pair.proximities],
+        "new": new,
     }
+    more = {f"more_{name}": max(0, len(found) - _MAX_ROWS) for name, found in lists.items()}
+    facts = {"meshes": pair.meshes, "hits": pair.hits, "depth": pair.depth, "is_initial": pair.is_initial}
+    return facts | {name: found[:_MAX_ROWS] for name, found in lists.items()} | more

@@ -140,8 +140,8 @@ function fillPairs() {
       add(cell, "span", { class: "muted" }, `at ${short(time)}`);
     } },
     { title: "Collisions", class: "wide-only", key: (row) => pairs[row].hits, fill: (cell, row) => {
-      const { spans, more } = pairs[row];
-      fillSpans(cell, spans.map(([since, until, hits]) => `${range(since, until)}: ${count(hits)}`), more);
+      const { spans, more_spans } = pairs[row];
+      fillSpans(cell, spans.map(([since, until, hits]) => `${range(since, until)}: ${count(hits)}`), more_spans);
     } },
     { title: "Intersections at rest", class: "wide-only", key: (row) => pairs[row].rest.reduce((most, span) => Math.max(most, span[2]), 0), fill: (cell, row) => {
       const { rest, more_rest } = pairs[row];
