@@ -61,6 +61,7 @@ examples:
   warp-bsc replay cloth.usd --json > collisions.json
   warp-bsc replay cloth.usd --clearance 0.002 --fail-on distance
   warp-bsc replay shot.usd --ignore-initial --ignore '/World/Hair*' /World/Head
+  warp-bsc replay shot.usd --triage shot.triage.json --fail-on intersections
   warp-bsc replay shot.usd --baseline hits_v1.json --fail-on new || echo "worse"
   warp-bsc replay shot.usd --report hits.html --json hits.json --limit 1000
   warp-bsc replay shot.usd --workers 16 --json hits.json --resume

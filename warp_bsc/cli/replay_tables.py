@@ -9,7 +9,7 @@ from ..bench.tables import LONGEST, Column, count
 from ..repairing.shot.findings import closed_meshes, kept_meshes
 from ..scene_replay.baseline import NewFinding
 from ..scene_replay.report_data import PairFindings, length, pairs_of_meshes, verdict
-from ..scene_replay.results import Contact, IntersectionSummary, IntervalSummary, Nearest, Work
+from ..scene_replay.results import Contact, IntersectionSummary, Nearest, Work
 from ..scene_replay.scene_pairs import PHASES
 from ..scene_replay.summary import CERTIFIED_FOR, IntersectionSpan, Summary
 from ..scene_replay.validation import Validation
@@ -24,9 +24,6 @@ _INTERVALS = (
     Column("First at", lambda interval: round(interval.earliest.time, 6), ".6g"),
 )
 _NEAREST = (Column("Distance", "distance", ".6g"), Column("Time", "time", "g"), *_POSITION)
-
-_WITH_EDGES = 60
-"""Least width of a terminal on which the table of intervals has the edges in faces."""
 
 _RANGES = 4
 """Most ranges of time in a line."""
@@ -202,8 +199,7 @@ def _print_intervals(console: Console, summary: Summary) -> None:
     arrow = "->" if console.options.ascii_only else "→"
     listed = sorted(summary.worst[:LONGEST], key=lambda interval: interval.index)
     rows = [(f"{interval.start:g} {arrow} {interval.end:g}", interval) for interval in listed]
-    columns = [*_INTERVALS, *[Column("Edges in faces", _edges)] * (console.width >= _WITH_EDGES)]
-    print_table(console, Column("Frames", kind="word"), columns, rows)
+    print_table(console, Column("Frames", kind="word"), _INTERVALS, rows)
     if len(listed) < len(summary.intervals):
         more = len(summary.colliding) - len(listed)
         others = count(len(summary.intervals) - len(listed), "interval")
@@ -301,11 +297,6 @@ def _contact(found: Contact | Nearest) -> str:
     """Returns the prims and the elements of two that meet, or are nearest, in words."""
     (first, second), (element, other) = found.meshes, found.elements
     return f"{first}, {element}, with {'its' if first == second else f'{second},'} {other}"
-
-
-def _edges(interval: IntervalSummary) -> int | None:
-    """Returns the number of edges that meet faces at the start of an interval, None if these were not looked for."""
-    return interval.intersections and interval.intersections[0].crossings + interval.intersections[0].touches
 
 
 def _pair(meshes: tuple[str, str]) -> str:

@@ -128,7 +128,7 @@ def report_data(summary: Summary, baseline: Baseline | None) -> dict:
         (f"{summary.hits:,}", "collisions"),
         (f"{len(summary.colliding):,} of {len(summary.intervals):,}", "intervals with collisions"),
     ]
-    if first := summary.first_contact:
+    if summary.colliding and (first := summary.colliding[0].earliest):
         tiles.append((f"{first.time:.6g}", "time code of the first"))
     if looked:
         tiles.append((f"{intersecting:,} of {len(summary.intersections):,}", "times with intersections at rest"))

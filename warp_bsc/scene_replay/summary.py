@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import TypeVar
 
 from ..usd.scene import Scene
-from .results import TOI_BINS, Contact, IgnoredPair, IntersectionSummary, IntervalSummary, Nearest, ProximitySummary
+from .results import TOI_BINS, IgnoredPair, IntersectionSummary, IntervalSummary, Nearest, ProximitySummary
 from .validation import Validation
 
 _Span = TypeVar("_Span")
@@ -190,11 +190,6 @@ class Summary:
     def worst(self) -> list[IntervalSummary]:
         """The intervals with collisions, those with the most first."""
         return sorted(self.colliding, key=lambda interval: -interval.hits)
-
-    @property
-    def first_contact(self) -> Contact | None:
-        """The earliest contact, None if there is none."""
-        return self.colliding[0].earliest if self.colliding else None
 
     @property
     def hits(self) -> int:

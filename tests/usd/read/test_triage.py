@@ -105,7 +105,7 @@ def test_a_stopped_run_resumes_with_what_is_meant(stage, tmp_path):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"\xff", "it is not UTF-8"),
+        (b"\xff", "'utf-8' codec can't decode byte 0xff in position 0"),
         (b"{", "Expecting property name"),
         (b"[]", "the file must be an object, not []"),
         ({"version": 1, "ment": []}, "the file: unknown key 'ment'; the keys are version, meant"),

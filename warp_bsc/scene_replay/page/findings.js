@@ -166,6 +166,6 @@ function showPairs() {
   const shown = data.pairs.map((_, row) => row).filter((row) => !isMeant(...data.pairs[row].meshes.map((name) => meshNumbers.get(name))));
   const later = shown.filter((row) => !data.pairs[row].is_initial).length;
   const first = later && later < shown.length ? `${plural(later, "begins", "begin")} after the first time and ${later === 1 ? "comes" : "come"} first; of each kind ` : "";
-  byId("pairs-count").textContent = shown.length ? `${plural(shown.length, "pair")}; ${first}the deepest first` : "";
+  byId("pairs-count").textContent = shown.length > 1 ? `${plural(shown.length, "pair")}; ${first}the deepest first` : plural(shown.length, "pair");
   pairTable.show(shown);
 }

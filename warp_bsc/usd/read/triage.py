@@ -77,9 +77,7 @@ def read_triage(path: str | os.PathLike) -> tuple[Meant, ...]:
         if found["version"] != 1:
             raise ValueError(f"version is {found['version']}, and this version of warp-bsc reads version 1")
         return tuple(_read_entry(entry, f"meant[{number}]") for number, entry in enumerate(found["meant"]))
-    except UnicodeDecodeError:
-        raise ValueError(f"{path}: not a triage file: it is not UTF-8") from None
-    except ValueError as error:
+    except ValueError as error:  # of its encoding, too
         raise ValueError(f"{path}: not a triage file: {error}") from None
 
 
