@@ -1,5 +1,9 @@
 """The rules of NVIDIA's USD validation, which run where its package is installed."""
 
+import json
+import time
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 from pxr import Usd, UsdGeom
@@ -104,3 +108,37 @@ def test_what_cannot_be_fixed_stays_as_it_is(stage):
     (result, *_) = nvidia.IssueFixer(stage).fix(found(stage)[:1])
     assert result.status == nvidia.FixStatus.FAILURE and "remain" in str(result.exception)
     assert stage.GetRootLayer().ExportToString() == before
+
+
+def test_what_is_meant_is_neither_an_issue_nor_repaired(tmp_path):
+    """A sheet goes through a wall, as a file beside the root layer says it should."""
+    stage = sheet_through_a_wall(tmp_path)
+    entry = {"meshes": ["/World/Sheet", "/World/Wall"], "reason": "a ghost", "who": "ada", "date": "2026-11-29"}
+    triage = tmp_path / "sheet.triage.json"
+    triage.write_text(json.dumps({"version": 1, "meant": [entry]}))
+    issues = found(stage)
+    assert [issue.severity for issue in issues] == 2 * [nvidia.IssueSeverity.INFO]
+    said = f"{triage} was read. Not counted: 1 meant pair of meshes, "
+    assert all(issue.message.startswith(said) for issue in issues)
+    before = stage.GetRootLayer().ExportToString()
+    rules.repair_stage(stage)
+    assert stage.GetRootLayer().ExportToString() == before
+
+
+def test_rules_run_one_at_a_time(stage, monkeypatch):
+    """Warp starts, and compiles, once for all; the engine runs rules in threads."""
+    running, most, whole = [], [], rules.check_stage
+
+    def counted(*arguments):
+        running.append(1)
+        most.append(len(running))
+        time.sleep(0.05)
+        issues = whole(*arguments)
+        running.pop()
+        return issues
+
+    monkeypatch.setattr(rules, "check_stage", counted)
+    with ThreadPoolExecutor(4) as pool:
+        checkers = [rule() for rule in (rules.MeshOverlapChecker, rules.MeshCollisionChecker) for _ in range(2)]
+        list(pool.map(lambda checker: checker.CheckStage(stage), checkers))
+    assert most == [1, 1, 1, 1]

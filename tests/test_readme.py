@@ -45,7 +45,7 @@ def test_the_scene_of_the_readme_replays_with_its_figures(capsys, tmp_path, monk
     monkeypatch.chdir(tmp_path)
     assert main(["replay", "demo", "--device", "cpu"]) == 0
     output = capsys.readouterr().out
-    assert "Collisions in 12 of 14 intervals" in output and "33 of" in output
+    assert "Collisions in 12 of 14 intervals" in output and "33 collisions from" in output
     assert "33 collisions of a recorded scene that comes with it, in 12 of 14 intervals" in README.replace("\n", " ")
 
 

@@ -63,6 +63,7 @@ if TYPE_CHECKING:  # type checkers and editors do not look into __getattr__
     from .scene_replay.scene_intersections import SceneIntersections
     from .scene_replay.scene_proximities import SceneProximities
     from .usd.frames import FrameRange
+    from .usd.read.triage import read_triage
     from .usd.scene import Scene
     from .usd.selection import Selection
 
@@ -106,6 +107,7 @@ _MODULES = {
     "query_vertex_edge": "detection.queries.query",
     "query_vertex_face": "detection.queries.query",
     "query_vertex_vertex": "detection.queries.query",
+    "read_triage": "usd.read.triage",
     "repair": "repairing.repair",
     "repair_state": "repairing.state",
     "replay": "scene_replay.intervals",
@@ -152,6 +154,7 @@ __all__ = [
     "query_vertex_edge",
     "query_vertex_face",
     "query_vertex_vertex",
+    "read_triage",
     "repair",
     "repair_state",
     "replay",

@@ -22,6 +22,7 @@ from .repairing.shot.findings import find_collisions
 from .repairing.shot.repair_shot import repair_shot
 from .scene_replay.intervals import replay
 from .scene_replay.stage_check import check_stage
+from .usd.read.triage import select_by_triage
 from .usd.scene import Scene
 from .usd.write.points_layer import PointsLayer
 
@@ -50,6 +51,8 @@ class _Checker(BaseRuleChecker):
             prims = tuple(usdStage.GetPrimAtPath(path) for path in issue.prims)
             if issue.kind == "Unreadable":
                 self._AddError(f"Not checked: {issue.text}", requirement=self._requirement)
+            elif issue.kind == "Meant":
+                self._AddInfo(issue.text, requirement=self._requirement)
             elif issue.kind in self._kinds:
                 add = self._AddWarning if issue.kind in ("Inside", "Duplicates") else self._AddFailedCheck
                 add(issue.text, prims, fix if issue.kind in FIXED else None, requirement=self._requirement)
@@ -103,7 +106,8 @@ def repair_stage(stage: Usd.Stage, _at: object = None) -> None:
     target = stage.GetEditTarget()
     if not target.GetMapFunction().timeOffset.IsIdentity():
         raise ValueError(f"{target.GetLayer().identifier}: its times are shifted or scaled in the stage")
-    scene, before = Scene(stage), Sdf.Layer.CreateAnonymous()
+    _, selection = select_by_triage(stage)
+    scene, before = Scene(stage, selection=selection), Sdf.Layer.CreateAnonymous()
     findings = list(find_collisions(scene, replay(scene), unrepaired_pairs=()))
     before.TransferContent(target.GetLayer())
     with tempfile.TemporaryDirectory() as folder:

@@ -101,15 +101,14 @@ def test_replay_table_fits_a_terminal(capsys, monkeypatch, falling_scene):
     output = run(capsys, "replay", falling_scene)
     lines = output.splitlines()
     start = next(number for number, line in enumerate(lines) if "Frames" in line)
-    assert lines[start].split() == ["Frames", "Collisions", "First", "contact", "At", "x", "y", "z"]
-    assert max(map(len, lines[start : start + 6])) <= 80
+    assert lines[start].split() == ["Frames", "Collisions", "Mesh", "pairs", "First", "at"]
+    assert max(map(len, lines[start : start + 3])) <= 80
     row = next(line for line in lines if line.startswith("3 → 4"))
-    assert " 3 /World/Falling, vertex 1, with /World/Floor, " in row and lines[lines.index(row) + 1].strip() == "face 0"
-    assert row.split()[-4:] == ["3.25", "0.6", "-0.5", "0"]  # when and where
+    assert row.split() == ["3", "→", "4", "3", "1", "3.25"]
     for part in (
         "2 meshes, 7 vertices, 3 faces, 4 intervals; method exact on cpu",
         "Collisions in 1 of 4 intervals: 3 vertex-face and 0 edge-edge pairs.",
-        "3 of /World/Floor with /World/Falling",
+        "  /World/Falling with /World/Floor: 3 collisions from 3 to 4\n",
         "The first at time 3.25: /World/Falling, vertex 1, with /World/Floor, face 0.",
         "Certified for vertices that move straight or turn about one axis between the times checked: every pair",
     ):
@@ -166,7 +165,7 @@ def test_self_collision(capsys, scenes):
         mesh.CreatePointsAttr().Set(FLOOR + [(x, y, z + 0.2 - time) for x, y, z in FALLING], time)
     stage.GetRootLayer().Save()
     output = run(capsys, "replay", path)
-    assert "3 of /Cloth with itself" in output
+    assert "  /Cloth with itself: 3 collisions from 0 to 1\n" in output
     assert "/Cloth, vertex 5, with its face 0." in output
 
 
@@ -515,7 +514,7 @@ def test_replay_table_on_a_narrow_terminal(capsys, monkeypatch, falling_scene, c
     stop = next(number for number, line in enumerate(lines) if "intervals not listed" in line)
     assert max(len(line.rstrip()) for line in lines[start:stop]) <= columns
     row = lines[start + 2].split()
-    assert (row[:5], "3.25" in row) == (["3", "→", "4", "3", "/World/Falling,"], True)  # frames, collisions, and when
+    assert row[:6] == ["3", "→", "4", "3", "1", "3.25"]  # frames, collisions, pairs of meshes, and when
     assert "…" not in "".join(lines[start:stop])
 
 

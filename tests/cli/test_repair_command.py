@@ -183,18 +183,18 @@ def test_replay_says_how_to_repair_only_what_a_repair_moves(tmp_path, capsys, mo
 
 
 def test_replay_says_how_to_repair(tmp_path, capsys):
-    """With all options that both commands have; pairs of a file become options."""
-    path = crossing_twice(tmp_path)
-    (tmp_path / "pairs.txt").write_text("'/World/Q *' /World/Plate\n")
+    """With all options that both commands have."""
+    path, triage = crossing_twice(tmp_path), tmp_path / "shot.triage.json"
+    triage.write_text('{"version": 1, "meant": []}')
     options = ["--device", "cpu", "--no-self", "--strict", "--frames", "0.0:20.0", "--purpose", "default", "proxy"]
-    options += ["--prims", "/World/*", "--ignore", "/World/Quad", "/World/Q 2"]
-    assert main(["replay", path, *options, "--ignore-from", str(tmp_path / "pairs.txt"), "--clearance", "0.1"]) == 0
+    options += ["--prims", "/World/*", "--ignore", "/World/Quad", "/World/Q 2", "--triage", str(triage)]
+    assert main(["replay", path, *options, "--clearance", "0.1"]) == 0
     (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("To repair: ")]
     words = shlex.split(line.removeprefix("To repair: "))
     assert words[:3] == ["warp-bsc", "repair", path] and words[-2:] == ["--output", "shot_repaired.usdc"]
     parser = argparse.ArgumentParser()
     add_repair(parser.add_subparsers(), "")
-    given = parser.parse_args(["repair", path, *options, "--ignore", "/World/Q *", "/World/Plate", *words[-2:]])
+    given = parser.parse_args(["repair", path, *options, *words[-2:]])
     assert vars(parser.parse_args(words[1:])) == vars(given)
 
 

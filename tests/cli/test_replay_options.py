@@ -35,7 +35,7 @@ VALUES = {
     "subdivide": ["--subdivide", "4"],
     "validate": ["--validate", "all"],
     "limit": ["--limit", "100"],
-    "ignore_from": ["--ignore-from", "pairs of.txt"],
+    "triage": ["--triage", "shot of.triage.json"],
     "prims": ["--prims", "/World/A*", "/World/B"],
     "exclude": ["--exclude", "/World/C"],
     "allow_missing": ["--allow-missing", "*.png"],

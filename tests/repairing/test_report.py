@@ -1,5 +1,6 @@
 """The page of a repair: its data, and what a browser shows of them."""
 
+import matplotlib.image
 import numpy as np
 import pytest
 from chromium import Browser
@@ -79,3 +80,40 @@ def test_page_in_chromium(page_path, tmp_path):
         browser.wait("location.hash === '#frame=0'")
         assert "largest move" not in browser.value("document.getElementById('after-title').textContent")
         assert browser.console == []
+
+
+@pytest.mark.browser
+def test_moves_and_stretch_are_painted(page_path, tmp_path):
+    """Moved points are between yellow and red by the root of their moves, as the legend says; others are not."""
+    with Browser(tmp_path / "profile") as browser:
+        browser.open(page_path)
+        page = Page(page_path.read_text())
+        index = int(np.argmax([frame["move"] for frame in page.data["frames"]]))
+        block = page.block(f"frame-{page.data['frames'][index]['view']}")
+        amount = np.array(browser.value(f"loadFrame(frames[{index}]).then((loaded) => [...loaded.amount])")).reshape(
+            -1, 2
+        )
+        moves = np.linalg.norm(block["displacement"].reshape(-1, 3), axis=1)
+        assert len(moves) > 10 and not np.delete(amount[:, 0], block["moved"]).any()
+        np.testing.assert_allclose(amount[block["moved"], 0], np.sqrt(moves / page.data["largest"]), atol=1e-4)
+
+        def colors(painted):
+            browser.value(f"(byId('painted').value = '{painted}', byId('painted').dispatchEvent(new Event('change')))")
+            browser.value(
+                "(async () => { for (let i = 0; i < 4; i += 1) await new Promise(requestAnimationFrame); })()"
+            )
+            left, top, right, bottom = map(round, browser.box("#canvas"))
+            browser.screenshot(tmp_path / "view.png", whole=False)
+            return matplotlib.image.imread(tmp_path / "view.png")[top:bottom, left:right, :3].reshape(-1, 3)
+
+        browser.value("byId('canvas').scrollIntoView({block: 'center'})")
+        red, green, blue = colors("moves").T
+        warm = (blue < 0.4 * red) & (red > 0.2)
+        assert warm.sum() > 500  # shading scales all three channels: green against red goes from 0.82 to 0.11
+        assert (green / np.maximum(red, 0.01))[warm].min() < 0.25  # the largest moves
+        legend = browser.value(
+            "[...document.querySelectorAll('#viewer-legend rect')].map((key) => getComputedStyle(key).fill)"
+        )
+        assert len(legend) == 4 + 2 and legend[3] == "rgb(204, 23, 28)"
+        red, _, blue = colors("none").T
+        assert not ((blue < 0.4 * red) & (red > 0.2)).any()

@@ -18,6 +18,8 @@ from warp_bsc.repairing.shot.blend import BLEND, blend
 from warp_bsc.repairing.shot.findings import find_collisions
 from warp_bsc.repairing.shot.mesh_groups import groups_of
 from warp_bsc.repairing.shot.repair_shot import repair_shot
+from warp_bsc.repairing.shot.stretch import FollowedMesh, ShotFrame, StretchRecorder
+from warp_bsc.usd.write.points_layer import MovedFrame
 
 
 @pytest.fixture(scope="module")
@@ -110,6 +112,24 @@ def test_springs_relax_what_contacts_strain(tmp_path, capsys, dip):
     (stretch,) = found["stretches"]
     assert found["remaining"] == {"collisions": 0, "intersections": 0} and not stretch["uncertified"]
     assert stretch["edge_ratio"][0] > 0.9 and stretch["edge_ratio"][1] < 1.1
+
+
+@pytest.mark.parametrize(("length", "is_good"), [(1e-4, True), (0.04, False)])
+def test_an_edge_of_no_length_in_the_shot_does_not_wreck_a_frame(tmp_path, length, is_good):
+    """Two points of the sheet are nearly one; when the one is moved and the other is not, their edge counts only if it
+    has a length: a thousandth of the median one, an eighth of a unit, is the limit."""
+    n = SIZE + 1
+    given = sheet(0.0)
+    given[1] = given[0] + np.float32((length / SIZE, 0, 0))
+    x = given.copy()
+    x[1] += np.float32((1.0 / SIZE, 0, 0))
+    edges = np.array([(row * n + i, row * n + i + 1) for row in range(n) for i in range(SIZE)])
+    recorder = StretchRecorder(FollowedMesh(np.ones(len(given), bool), edges, 1.0 / SIZE))
+    moved = MovedFrame(0.0, False, None, np.array([1]), x[1:2].astype(np.float64))
+    recorder.add(ShotFrame(given, x, x - given), moved)
+    stretch = recorder.finish([])
+    assert bool(stretch.distorted()) != is_good
+    assert 0 < stretch.edge_ratio[0] <= 1 <= stretch.edge_ratio[1]
 
 
 def test_kept_meshes_do_not_move_and_are_not_left(tmp_path, capsys):

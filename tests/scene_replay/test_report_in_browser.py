@@ -93,7 +93,7 @@ def test_meshes_are_isolated_hidden_and_ghosts(tmp_path, browser):
     browser.wait("document.querySelectorAll('#meshes tr[data-at]').length === 4")
 
     before = picture(browser, tmp_path)
-    browser.click("#meshes .states button", 3 * 1 + 0)  # the second by name: isolate Strip0
+    browser.click("#meshes .states button", 4 * 1 + 0)  # the second by name: isolate Strip0
     assert browser.value(shown) == ["/World/Strip0"]
     assert browser.value("byId('meshes-count').textContent") == "4 meshes, 3 hidden"
     assert browser.value("location.hash").endswith("only=%2FWorld%2FStrip0")
@@ -104,14 +104,14 @@ def test_meshes_are_isolated_hidden_and_ghosts(tmp_path, browser):
     visible = "loadView(state.interval).then((shown) => [shown.hits.first.length, visibleRows(shown.hits).length])"
     number, seen = browser.value(visible)
     assert number > 100 and seen == 0
-    browser.click("#meshes .states button", 3 * 1 + 0)
+    browser.click("#meshes .states button", 4 * 1 + 0)
     assert browser.value(shown) == sorted(names) and browser.value("byId('show-all').hidden")
     np.testing.assert_array_equal(picture(browser, tmp_path), before)
 
-    browser.click("#meshes .states button", 3 * 0 + 1)  # the floor as a ghost
+    browser.click("#meshes .states button", 4 * 0 + 1)  # the floor as a ghost
     ghost = picture(browser, tmp_path)
     assert browser.value("byId('meshes-count').textContent") == "4 meshes, 1 ghost"
-    browser.click("#meshes .states button", 3 * 0 + 2)
+    browser.click("#meshes .states button", 4 * 0 + 2)
     hidden = picture(browser, tmp_path)
     assert (np.abs(ghost - hidden).max(axis=2) > 0.02).sum() > 500 < (np.abs(ghost - before).max(axis=2) > 0.02).sum()
     address = browser.value("location.hash")
@@ -178,9 +178,9 @@ def test_pairs_are_in_order_of_depth(tmp_path, browser):
     assert depths == [[pytest.approx(0.375), 0], None]
     browser.open(page)
     cells = "[...document.querySelectorAll('#pairs tr[data-at] td:nth-child(2)')].map((cell) => cell.textContent)"
-    assert browser.value(cells) == ["0.375at 0", ""]
+    assert browser.value(cells) == ["37.5 cmat 0", ""]
     browser.click("#pairs th button", 1)
-    assert browser.value(cells) == ["", "0.375at 0"]
+    assert browser.value(cells) == ["", "37.5 cmat 0"]
 
 
 def test_depth_is_of_the_deepest_time(tmp_path):
@@ -219,7 +219,7 @@ def test_sentence_says_what_was_not_checked(tmp_path):
     said = sentence_of(stage, "--ignore", "/World/Floor", "/World/Falling")
     assert said.startswith("Nothing collides, nothing intersects: 1 interval and 2 times of 2 meshes and 3 triangles ")
     assert said.endswith(
-        " Left out: 1 collision of ignored pairs. Only some pairs of meshes were checked, as options say."
+        " Not counted: 1 ignored pair of meshes, 1 collision. Only some pairs of meshes were checked, as options say."
     )
     said = sentence_of(stage, "--prims", "/World/Falling", "--no-intersections", "--method", "float")
     assert said == (

@@ -1,11 +1,13 @@
 """The rule of OpenUSD's validation framework, as other programs find and run it."""
 
+import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
-from pxr import Gf, Usd, UsdGeom
+from pxr import Gf, Sdf, Usd, UsdGeom
 from usd_stages import CORNERS, FALLING, add_mesh, add_tets, falling_stage, moved, new_stage, save
 
 UsdValidation = pytest.importorskip("pxr.UsdValidation")
@@ -120,3 +122,31 @@ import warp_bsc.scene_replay.usd_validation
     )
     environment = os.environ | {"PXR_PLUGINPATH_NAME": rules.PLUGIN_FOLDER}
     subprocess.run([sys.executable, "-c", program], env=environment, check=True)
+
+
+@pytest.mark.parametrize("how", ["beside", "named", "asset"])
+def test_what_is_meant_is_no_error(stage, tmp_path, how):
+    """By the file beside the root layer, or the one that the root layer names."""
+    beside = tmp_path / f"{Path(stage.GetRootLayer().realPath).stem}.triage.json"
+    triage = beside if how == "beside" else tmp_path / "of_the_show.json"
+    entry = {"meshes": ["/World/Crossing", "/World/Floor"], "reason": "grows in it", "who": "ada", "date": "2026-11-29"}
+    triage.write_text(json.dumps({"version": 1, "meant": [entry, entry | {"meshes": ["/World/Gone"]}]}))
+    if how != "beside":
+        beside.write_text("not read")
+        named = f"./{triage.name}" if how == "named" else Sdf.AssetPath(f"./{triage.name}")
+        stage.GetRootLayer().customLayerData = {"warp_bsc:triage": named}
+    *errors, meant = found(stage)
+    assert [name for name, _, _ in errors] == ["Collision", "Intersection"]
+    assert not any("/World/Crossing" in prims for _, _, prims in errors)
+    assert meant[0] == "Meant" and meant[1].startswith(f"{triage} was read. Not counted: 1 meant pair of meshes, 0 ")
+    assert meant[1].endswith("entries that match no meshes: 1, the first is /World/Gone")
+    triage.write_text("{}")
+    ((name, text, _),) = found(stage)
+    assert name == "Unreadable" and text == f"{triage}: not a triage file: the file: version is missing"
+    if how != "beside":
+        triage.unlink()
+        ((name, text, _),) = found(stage)
+        assert name == "Unreadable" and text == f"{triage}: No such file or directory"
+        stage.GetRootLayer().customLayerData = {"warp_bsc:triage": 3}
+        ((name, text, _),) = found(stage)
+        assert name == "Unreadable" and text.endswith("warp_bsc:triage must be the path of a triage file, not 3")

@@ -12,6 +12,7 @@ import math
 import re
 import signal
 import sys
+import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -422,6 +423,8 @@ def calls_of_scenes() -> dict[str, Call]:
     """Returns the callables that need a USD file."""
     path = ASSETS / "cloth_twist.usd"
     scene = bsc.Scene(path)
+    triage = Path(tempfile.mkdtemp()) / "shot.triage.json"
+    triage.write_text('{"version": 1, "meant": []}')
     bound = without(NUMBERS, "None")
     times = {"start": bound, "end": bound | {"before": 0.0}, "step": bound | {"zero": 0.0, "negative": -1.0}}
     return {
@@ -436,9 +439,15 @@ def calls_of_scenes() -> dict[str, Call]:
                 "between": without(STRINGS, "None") | {"three": ("/A", "/B", "/C"), "one": ("/A",)},
                 "purposes": STRINGS | {"unknown": ("shown",)},
                 "ignore": PAIRS,
+                "triage": {**OBJECTS, "path": "shot.triage.json", "pairs": (("/A", "/B"),)},
                 "ignored_names": PAIRS,
                 "ignored_inside": PAIRS,
             },
+        ),
+        "read_triage": Call(
+            bsc.read_triage,
+            {"path": triage},
+            {"path": {"None": None, "number": 3.0, "list": [triage]}},
         ),
         "Scene": Call(
             bsc.Scene,
@@ -714,6 +723,7 @@ INTERNAL = {
     "Selection.ignored_pairs",
     "Selection.includes",
     "Selection.may_be_inside",
+    "Selection.meant",
     "Selection.unmatched",
 }
 """Methods that the package calls with objects of its own."""
@@ -862,7 +872,7 @@ TEXTS = {
     "--figure",
     "--between",
     "--ignore",
-    "--ignore-from",
+    "--triage",
     "--overlay",
     "--report",
     "--json",

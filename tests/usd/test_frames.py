@@ -16,7 +16,8 @@ def test_frame_ranges(tmp_path, capsys):
     found = find(stage)
     assert [(span["since"], span["until"]) for span in found["collision_spans"]] == [(0, 2), (4, 5)]
     assert sum(span["hits"] for span in found["collision_spans"]) == found["hits"]
-    assert f"{found['hits']} of /World/Floor with /World/Bouncing, from 0 to 2, 4 to 5\n" in capsys.readouterr().out
+    said = f"{found['hits']} collisions from 0 to 2, 4 to 5; "
+    assert f"  /World/Bouncing with /World/Floor: 25 cm deep at 1; {said}" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

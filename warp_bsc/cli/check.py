@@ -15,6 +15,7 @@ from ..mesh_files.check import check
 from ..mesh_files.frames import Frames, find_frames
 from ..mesh_files.mesh_file import MeshScene
 from ..repairing.surface import weld_borders, welded
+from ..scene_replay.depths import DepthRecorder
 from ..scene_replay.html_report import ReportPage
 from ..scene_replay.summary import Summary
 from .device import find_device, loading_kernels
@@ -137,13 +138,15 @@ def _with_motion(frames: Frames) -> Frames:
 def _report(path: str, frames: Frames, device: str) -> None:
     """Writes the page of a replay of the files."""
     scene = read_frames(frames)
-    page, intervals = ReportPage(path, scene=scene), []
+    page, intervals, depths = ReportPage(path, scene=scene), [], DepthRecorder()
     try:
         with naming(path):
             for result in tracked(scene, "Replaying", device):
                 page.add(result)
+                depths.add(result)
                 intervals.append(result.summary)
-            page.finish(Summary(scene, intervals=intervals, method="exact", device=device, clearance=None))
+            found = {"intervals": intervals, "depths": depths.largest()}
+            page.finish(Summary(scene, method="exact", device=device, clearance=None, **found))
     finally:
         page.discard()
 

@@ -141,6 +141,11 @@ class RepairRun:
             )
         if kept_hits := sum(finding.kept_hits for finding in journal.findings):
             self.notes.append(f"collisions of meshes that are not moved with each other: {kept_hits:,}, not counted")
+        if ignored := {pair for finding in journal.findings for pair in finding.ignored_pairs}:
+            self.notes.append(
+                f"pairs of meshes that collide, and are meant to or ignored: {len(ignored):,}, not counted and not "
+                f"repaired, the first is {' with '.join(min(ignored))}"
+            )
         self.seconds["finding"] = time.perf_counter() - started
         done = 0
         for stretch in journal.stretches(scene):

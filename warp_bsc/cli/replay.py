@@ -2,10 +2,9 @@
 
 import argparse
 import os
-import shlex
 from typing import Any
 
-from .._atomic_file import STDOUT, naming, unfinished_path
+from .._atomic_file import STDOUT, unfinished_path
 from ..scene_replay.baseline import Baseline
 from ..scene_replay.workers import device_of_cluster
 from ..usd.scene import Scene
@@ -83,11 +82,10 @@ def _open_scene(arguments: argparse.Namespace) -> Scene:
     for path in paths:
         if paths.count(path) > 1:
             raise ValueError(f"{path}: named twice, as two files of a replay")
-    ignored = _read_pairs(arguments.ignore_from) if arguments.ignore_from else ()
     scene = read_scene(
         arguments.scene,
         arguments,
-        selection=read_selection(arguments, ignored),
+        selection=read_selection(arguments),
         frames=arguments.frames,
         subdivide=arguments.subdivide,
         as_json=arguments.progress == "json",
@@ -102,23 +100,3 @@ def _describe_options(scene: Scene, arguments: argparse.Namespace) -> dict[str, 
     """Returns the options that the results depend on, except method, device and clearance."""
     names = "subdivide", "intersections", "ignore_initial", "validate", "limit"
     return describe_selection(scene, arguments) | {name: getattr(arguments, name) for name in names}
-
-
-def _read_pairs(path: str) -> list[tuple[str, str]]:
-    """Reads pairs of patterns from a file.
-
-    Raises:
-        OSError: If it cannot be read.
-        ValueError: If a line has not two patterns.
-    """
-    pairs = []
-    with naming(path), open(path, encoding="utf-8") as file:
-        for number, line in enumerate(file, 1):
-            try:
-                patterns = shlex.split(line, comments=True)
-            except ValueError as error:
-                raise ValueError(f"{path}: line {number}: {error}") from None
-            if len(patterns) not in (0, 2):
-                raise ValueError(f"{path}: line {number}: must be two patterns, not {len(patterns)}")
-            pairs += [(patterns[0], patterns[1])] if patterns else []
-    return pairs

@@ -4,7 +4,6 @@ import argparse
 import importlib
 import math
 import shlex
-from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
@@ -13,6 +12,7 @@ from .._atomic_file import STDOUT
 from ..scene_replay.workers import checked_address
 from ..usd.frames import FrameRange
 from ..usd.read.openusd import check_openusd
+from ..usd.read.triage import read_triage
 from ..usd.scene import Scene
 from ..usd.selection import PURPOSES, Selection
 from .error_boundary import describe
@@ -61,6 +61,7 @@ examples:
   warp-bsc replay cloth.usd --json > collisions.json
   warp-bsc replay cloth.usd --clearance 0.002 --fail-on distance
   warp-bsc replay shot.usd --ignore-initial --ignore '/World/Hair*' /World/Head
+  warp-bsc replay shot.usd --triage shot.triage.json --fail-on intersections
   warp-bsc replay shot.usd --baseline hits_v1.json --fail-on new || echo "worse"
   warp-bsc replay shot.usd --report hits.html --json hits.json --limit 1000
   warp-bsc replay shot.usd --workers 16 --json hits.json --resume
@@ -105,15 +106,21 @@ def add_scene_selection(which: argparse._ArgumentGroup) -> None:
     add_options(which, _SCENE)
 
 
-def read_selection(arguments: argparse.Namespace, ignored: Iterable[tuple[str, str]] = ()) -> Selection:
-    """Returns the selection that the options of :func:`add_scene_selection` make, with more pairs that are ignored."""
+def read_selection(arguments: argparse.Namespace) -> Selection:
+    """Returns the selection that the options of :func:`add_scene_selection` make.
+
+    Raises:
+        OSError: If the file of ``--triage`` cannot be read.
+        ValueError: If it is not a triage file.
+    """
     return Selection(
         prims=tuple(arguments.prims),
         exclude=tuple(arguments.exclude),
         self_collisions=arguments.self_collisions,
         between=tuple(arguments.between) if arguments.between else None,
         purposes=tuple(arguments.purpose or Selection.purposes),
-        ignore=(*map(tuple, arguments.ignore), *ignored),
+        ignore=tuple(map(tuple, arguments.ignore)),
+        triage=read_triage(arguments.triage) if arguments.triage else (),
     )
 
 
@@ -162,24 +169,21 @@ def command_of(arguments: argparse.Namespace) -> str:
     for name, default in (("method", "exact"), ("subdivide", 1), ("validate", 0)):
         value = getattr(arguments, name)
         words += [_option(name), str(value)] if value != default else []
-    for name in ("clearance", "limit", "ignore_from"):
+    for name in ("clearance", "limit"):
         value = getattr(arguments, name)
         words += [_option(name), str(value)] if value is not None else []
-    return shlex.join(words + _selection_words(arguments, arguments.ignore))
+    return shlex.join(words + _selection_words(arguments))
 
 
 def repair_command_of(scene: Scene, arguments: argparse.Namespace) -> str:
-    """Returns the command that repairs what a replay with given options finds: with those that both commands have.
-
-    ``warp-bsc repair`` reads no pairs from a file, and gets those of ``--ignore-from`` one by one.
-    """
-    words = ["warp-bsc", "repair", arguments.scene, *_selection_words(arguments, scene.selection.ignore)]
+    """Returns the command that repairs what a replay with given options finds: with those that both commands have."""
+    words = ["warp-bsc", "repair", arguments.scene, *_selection_words(arguments)]
     words += ["--device", arguments.device] if arguments.device else []
     return shlex.join([*words, "--output", f"{Path(scene.path).stem}_repaired.usdc"])
 
 
-def _selection_words(arguments: argparse.Namespace, ignore: Iterable[Sequence[str]]) -> list[str]:
-    """Returns the options of :func:`add_scene_selection`, with pairs that are to be ignored, as words of a command."""
+def _selection_words(arguments: argparse.Namespace) -> list[str]:
+    """Returns the options of :func:`add_scene_selection` as words of a command."""
     words = ["--no-self"] * (not arguments.self_collisions) + ["--strict"] * arguments.strict
     if frames := arguments.frames:
         numbers = [frames.start, frames.end] + [frames.step] * (frames.step is not None)
@@ -187,9 +191,9 @@ def _selection_words(arguments: argparse.Namespace, ignore: Iterable[Sequence[st
     for name in ("between", "purpose", "prims", "exclude", "allow_missing"):
         values = getattr(arguments, name)
         words += [_option(name), *values] if values else []
-    for meshes in ignore:
+    for meshes in arguments.ignore:
         words += ["--ignore", *meshes]
-    return words
+    return words + (["--triage", arguments.triage] if arguments.triage else [])
 
 
 def _option(name: str) -> str:
@@ -250,6 +254,10 @@ _SCENE: Options = {
         "action": "append",
         "default": [],
     },
+    "--triage": file_option(
+        "ignore the meshes that a file says are meant to meet, each with a reason: only count them; the page of "
+        "replay --report writes such files"
+    ),
     "--purpose": {
         "nargs": "+",
         "action": "extend",
@@ -282,10 +290,6 @@ _SELECTION: Options = {
         "samples are not checked, nor are those of curves and points; an edge that passes through a face is an "
         "intersection instead",
         metavar="D",
-    ),
-    "--ignore-from": file_option(
-        "read pairs for --ignore from a file: two patterns a line, in quotation marks if they contain blanks; # "
-        "begins a comment"
     ),
     "--ignore-initial": flag(
         "ignore all pairs of meshes that cross at the first time, and meshes that cross themselves then; for "

@@ -9,6 +9,7 @@ from typing import Any
 
 from .._atomic_file import STDOUT, naming
 from ..scene_replay.baseline import Baseline
+from ..scene_replay.depths import DepthRecorder
 from ..scene_replay.earlier import find_earlier
 from ..scene_replay.hit_columns import HitsNpz
 from ..scene_replay.hit_files import HitsCsv, HitsJson, replay_facts
@@ -64,6 +65,7 @@ class ReplayRun(contextlib.ExitStack):
         self._intervals: list[IntervalSummary] = []
         self._works: list[Work | None] = []
         self._writing = 0.0
+        self._depths = DepthRecorder()
         self._outputs: list[ReplayOutput] = []
         try:
             self._earlier = find_earlier(arguments.json, facts) if arguments.resume else None
@@ -106,7 +108,8 @@ class ReplayRun(contextlib.ExitStack):
             self._find(written)
             stopped = f"stopped by an error: {self.problems[0]}" if self.problems else str(self.interrupt or "")
             limit = self._arguments.limit
-            summary = Summary(self._scene, intervals=self._intervals, stopped=stopped, limit=limit, **self._settings)
+            found = {"intervals": self._intervals, "depths": self._depths.largest()}
+            summary = Summary(self._scene, stopped=stopped, limit=limit, **found, **self._settings)
             finished = self._finish(summary)
             if self.problems:
                 raise ValueError("; ".join([str(self.interrupt)] * bool(self.interrupt) + self.problems))
@@ -162,6 +165,7 @@ class ReplayRun(contextlib.ExitStack):
         """Writes an interval to all files."""
         started = time.perf_counter()
         self._scene.files.check()
+        self._depths.add(result)
         if self._arguments.limit:
             result = limit_rows(result, self._arguments.limit)
         for output in self._outputs:

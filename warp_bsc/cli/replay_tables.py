@@ -8,24 +8,20 @@ from rich.console import Console
 from ..bench.tables import LONGEST, Column, count
 from ..repairing.shot.findings import closed_meshes, kept_meshes
 from ..scene_replay.baseline import NewFinding
-from ..scene_replay.results import Contact, IntersectionSummary, IntervalSummary, Nearest, Work
+from ..scene_replay.report_data import PairFindings, length, pairs_of_meshes, verdict
+from ..scene_replay.results import Contact, IntersectionSummary, Nearest, Work
 from ..scene_replay.scene_pairs import PHASES
 from ..scene_replay.summary import CERTIFIED_FOR, IntersectionSpan, Summary
 from ..scene_replay.validation import Validation
+from ..usd.scene import Scene
 from .option_names import with_option
 from .tables import print_table, say, say_list
 
-_WITH_POSITIONS = 60
-"""Least width of a terminal on which the table of intervals has positions."""
-
-_POSITION = [
-    Column(axis, lambda found, i=i: getattr(found, "earliest", found).position[i], ".4g")
-    for i, axis in enumerate("xyz")
-]
-_WORST = (
+_POSITION = [Column(axis, lambda found, i=i: found.position[i], ".4g") for i, axis in enumerate("xyz")]
+_INTERVALS = (
     Column("Collisions", "hits"),
-    Column("First contact", lambda interval: _contact(interval.earliest) + _others(interval), kind="text"),
-    Column("At", lambda interval: round(interval.earliest.time, 6), ".6g"),
+    Column("Mesh pairs", lambda interval: len(interval.mesh_pairs)),
+    Column("First at", lambda interval: round(interval.earliest.time, 6), ".6g"),
 )
 _NEAREST = (Column("Distance", "distance", ".6g"), Column("Time", "time", "g"), *_POSITION)
 
@@ -34,7 +30,7 @@ _RANGES = 4
 
 
 def print_replay(console: Console, summary: Summary) -> None:
-    """Prints a table of the worst intervals and a summary.
+    """Prints whether the scene is broken, by which pairs of meshes, the sums, and a table of the worst intervals.
 
     Args:
         console: The terminal or file to print to.
@@ -57,22 +53,17 @@ def print_replay(console: Console, summary: Summary) -> None:
             f"{summary.stopped}.",
         )
 
-    listed = summary.worst[:LONGEST]
-    if listed:
-        _print_worst(console, listed)
-    if listed and len(listed) < len(intervals):
-        say(
-            console,
-            f"{count(len(intervals) - len(listed), 'interval')} not listed, "
-            f"{len(summary.colliding) - len(listed)} with collisions; --json has all.",
-        )
+    if sentence := verdict(summary):
+        say(console, sentence, style="bold red" if sentence.startswith("Broken") else "bold")
+    pairs = pairs_of_meshes(summary)
+    _print_pairs(console, scene, pairs)
 
     if summary.colliding:
         _print_collisions(console, summary)
     elif not scene.is_still:
         say(console, f"No collision in {count(len(intervals), 'interval')}.")
     if summary.intersections:
-        _print_intersections(console, summary)
+        _print_intersections(console, summary, {pair.meshes for pair in pairs if pair.is_initial})
     for span in summary.duplicate_spans[:LONGEST]:
         say(console, f"{span.describe(LONGEST)}.")
     if (more := len(summary.duplicate_spans) - LONGEST) > 0:
@@ -83,11 +74,11 @@ def print_replay(console: Console, summary: Summary) -> None:
     if summary.clearance is not None:
         _print_proximities(console, summary, summary.clearance)
     if summary.ignored:
-        ignored = sum(hits for _, hits in summary.ignored)
-        say(console, f"Ignored: {count(ignored, 'colliding pair')} of {count(len(summary.ignored), 'pair')} of meshes.")
-        for meshes, hits in summary.ignored[:LONGEST]:
-            say(console, f"  {hits:,} of {_pair(meshes)}")
+        say(console, summary.not_counted)
+        say_list(console, [str(pair) for pair in summary.ignored], " pairs of meshes; --json has all.")
 
+    if summary.colliding:
+        _print_intervals(console, summary)
     if not scene.is_still:
         _print_certificate(console, summary)
     if summary.not_checked:
@@ -188,13 +179,31 @@ def _print_certificate(console: Console, summary: Summary) -> None:
         say(console, f"Certified for {CERTIFIED_FOR}: every pair tested.")
 
 
-def _print_worst(console: Console, listed: list[IntervalSummary]) -> None:
-    """Prints the intervals, those with the most collisions first: of which prims the first is, when and where."""
+def _print_pairs(console: Console, scene: Scene, pairs: list[PairFindings]) -> None:
+    """Prints a line for each pair of meshes: its depth, and the times and numbers of what meets."""
+    lines = []
+    for pair in pairs:
+        parts = [f"{length(scene, pair.depth[0])} deep at {pair.depth[1]:g}"] if pair.depth else []
+        if ranges := [f"{span.since:g} to {span.until:g}" for span in pair.collisions]:
+            more = f", and {len(ranges) - _RANGES} more times" * (len(ranges) > _RANGES)
+            parts.append(f"{count(pair.hits, 'collision')} from {', '.join(ranges[:_RANGES])}{more}")
+        parts += [f"at most {count(pair.edges, 'edge')} in faces"] * bool(pair.edges)
+        if parts:
+            parts += ["from the first time on"] * pair.is_initial
+            lines.append(f"{_pair(pair.meshes)}: {'; '.join(parts)}")
+    say_list(console, lines, " pairs of meshes; --json has all.")
+
+
+def _print_intervals(console: Console, summary: Summary) -> None:
+    """Prints the intervals with the most collisions, in order of time."""
     arrow = "->" if console.options.ascii_only else "→"
-    first = Column("Frames", kind="word")
-    positions = _POSITION if console.width >= _WITH_POSITIONS else ()
+    listed = sorted(summary.worst[:LONGEST], key=lambda interval: interval.index)
     rows = [(f"{interval.start:g} {arrow} {interval.end:g}", interval) for interval in listed]
-    print_table(console, first, [*_WORST, *positions], rows)
+    print_table(console, Column("Frames", kind="word"), _INTERVALS, rows)
+    if len(listed) < len(summary.intervals):
+        more = len(summary.colliding) - len(listed)
+        others = count(len(summary.intervals) - len(listed), "interval")
+        say(console, f"{others} not listed, {more} with collisions; --json has all.")
 
 
 def _print_collisions(console: Console, summary: Summary) -> None:
@@ -208,15 +217,6 @@ def _print_collisions(console: Console, summary: Summary) -> None:
         f"Collisions in {len(colliding)} of {count(len(summary.intervals), 'interval')}: "
         f"{', '.join(texts[:-1])} and {texts[-1]} pairs.",
     )
-    spans = defaultdict(list)
-    for span in summary.collision_spans:
-        spans[span.meshes].append(span)
-    lines = []
-    for meshes, hits in summary.mesh_pairs:
-        ranges = [f"{span.since:g} to {span.until:g}" for span in spans[meshes]]
-        more = f", and {len(ranges) - _RANGES} more times" * (len(ranges) > _RANGES)
-        lines.append(f"{hits:,} of {_pair(meshes)}, from {', '.join(ranges[:_RANGES])}{more}")
-    say_list(console, lines, " pairs of meshes; --json has all.")
     contact = colliding[0].earliest
     assert contact  # it collides
     say(console, f"The first at time {contact.time:.6g}: {_contact(contact)}.")
@@ -225,9 +225,13 @@ def _print_collisions(console: Console, summary: Summary) -> None:
     say(console, f"The most from time {worst.start:g} to {worst.end:g}: {worst.hits:,} {pairs}.")
 
 
-def _print_intersections(console: Console, summary: Summary) -> None:
-    """Prints the intersections at the times themselves, their spans of time, and the phases of the collisions."""
-    samples, spans = summary.intersections, summary.intersection_spans
+def _print_intersections(console: Console, summary: Summary, initial: set[tuple[str, str]]) -> None:
+    """Prints the intersections at the times themselves, their spans of time, and the phases of the collisions.
+
+    The spans of pairs of meshes that intersect at the first time already come last.
+    """
+    samples = summary.intersections
+    spans = sorted(summary.intersection_spans, key=lambda span: (min(span.meshes), max(span.meshes)) in initial)
     times = count(len(samples), "time")
     if not spans:
         say(console, f"No edge meets a face at rest, and no mesh is inside another, at {times}.")
@@ -293,12 +297,6 @@ def _contact(found: Contact | Nearest) -> str:
     """Returns the prims and the elements of two that meet, or are nearest, in words."""
     (first, second), (element, other) = found.meshes, found.elements
     return f"{first}, {element}, with {'its' if first == second else f'{second},'} {other}"
-
-
-def _others(interval: IntervalSummary) -> str:
-    """Returns how many other pairs of meshes than the first collide, in words."""
-    others = len(interval.mesh_pairs) - 1
-    return f"; also {count(others, 'other pair')}" * (others > 0)
 
 
 def _pair(meshes: tuple[str, str]) -> str:

@@ -15,8 +15,8 @@ from .summary import Summary
 Event = Literal["collides", "crosses", "is inside", "is near", "are duplicates", "inverts"]
 """What meshes may do in a replay."""
 
-_WITHOUT_EFFECT = {"intersections", "strict", "allow_missing", "validate", "limit"}
-"""The options that do not change what is compared; ``intersections`` is checked by itself."""
+_WITHOUT_EFFECT = {"intersections", "strict", "allow_missing", "validate", "limit", "ignore", "triage"}
+"""The options that do not change what is compared; ``intersections`` and what is ignored are checked by themselves."""
 
 
 class NewFinding(NamedTuple):
@@ -65,6 +65,7 @@ class Baseline:
                 found = _read(path)
             own_clearance, is_complete = found["clearance"], found["complete"]
             earlier = {"method": found["method"], **found["options"]}
+            no_more_ignored = _ignored(earlier) - _ignored(options)
             self._names = found["meshes"]
             for span in found["collision_spans"]:
                 self._add("collides", span)
@@ -89,6 +90,9 @@ class Baseline:
             raise ValueError(f"clearance: {path} lists no proximities, as its replay had no clearance")
         if clearance is not None and own_clearance < clearance:
             raise ValueError(f"clearance: {path} lists proximities up to {own_clearance:g}, less than {clearance:g}")
+        if no_more_ignored:
+            first = " with ".join(min(no_more_ignored))
+            raise ValueError(f"{path}: its replay ignored pairs that this one does not; cannot compare: {first}")
         now = json.loads(json.dumps({"method": method, **options}))
         for name in now:
             if name not in _WITHOUT_EFFECT and earlier.get(name) != now[name]:
@@ -133,6 +137,11 @@ class Baseline:
     def _add(self, event: Event, span: dict) -> None:
         meshes = tuple(sorted(self._names[mesh] for mesh in span["mesh"]))
         self._spans[event][meshes].append((span["since"], span["until"]))
+
+
+def _ignored(options: dict[str, Any]) -> set[tuple[str, ...]]:
+    """Returns the patterns of what is ignored, given the options of a replay: an earlier one, or this one."""
+    return {tuple(pair) for pair in options["ignore"]} | {tuple(entry["meshes"]) for entry in options["triage"]}
 
 
 def _read(path: str | os.PathLike) -> dict[str, Any]:

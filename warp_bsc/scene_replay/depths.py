@@ -19,6 +19,7 @@ import numpy as np
 from ..detection.at_rest.body_parts import connect_cells
 from ..detection.at_rest.closest_points import ClosestPointFinder
 from ..usd.segment import Segment
+from .results import IntervalResult
 from .scene_intersections import SceneIntersections
 
 _ON_SIDE = 1e-5  # barycentric coordinate up to which the closest point of a face is on a side of it
@@ -76,6 +77,32 @@ class DepthFinder:
             assert self._segment is not None
             self._shapes[mesh] = _Shape(self._segment, mesh)
         return self._shapes[mesh]
+
+
+class DepthRecorder:
+    """Measures the depths at all times of a replay."""
+
+    def __init__(self):
+        """Begins before the first interval."""
+        self._finder = DepthFinder()
+        self._depths: list[tuple[float, dict[tuple[str, str], float]]] = []  # time and depths at each interval's start
+        self._last: SceneIntersections | None = None  # at the end of the last interval
+
+    def add(self, result: IntervalResult) -> None:
+        """Measures the depths at the start of an interval, which follows the last one that was added."""
+        if result.intersections:
+            start, self._last = result.intersections
+            self._depths.append((start.time, self._finder.find(start)))
+
+    def largest(self) -> dict[tuple[str, str], tuple[float, float]]:
+        """Returns the largest depth of each two meshes, and the first time with it, by their sorted names."""
+        last = [(self._last.time, self._finder.find(self._last))] if self._last else []
+        found: dict[tuple[str, str], tuple[float, float]] = {}
+        for time, depths in self._depths + last:
+            for meshes, depth in depths.items():
+                if meshes not in found or depth > found[meshes][0]:
+                    found[meshes] = depth, time
+        return found
 
 
 class _Depth(NamedTuple):

@@ -52,7 +52,7 @@ class Duplicates:
         meshes, found = self._segment.meshes, []
         for same in self._duplicates:
             numbers = np.array(same)
-            if selection.between or selection.ignore or selection.ignored_names:
+            if selection.chooses_pairs:
                 pairs = numbers[np.stack(np.triu_indices(len(same), 1), axis=1)]
                 counted = selection.counted_pairs(meshes, pairs) & ~selection.ignored_pairs(meshes, pairs)
                 numbers = np.unique(pairs[counted])

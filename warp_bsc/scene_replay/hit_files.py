@@ -133,7 +133,7 @@ class HitsJson(RecordFile):
             "certified_for": CERTIFIED_FOR,
             "mesh_pairs": mesh_pairs_to_list(summary.mesh_pairs, numbers),
             "collision_spans": [with_numbers(span, numbers) for span in summary.collision_spans],
-            "ignored": mesh_pairs_to_list(summary.ignored, numbers),
+            "ignored": [with_numbers(pair, numbers) for pair in summary.ignored],
             "intersections": [
                 with_numbers(span, numbers) | {"trend": span.trend} for span in summary.intersection_spans
             ],

@@ -265,6 +265,7 @@ def read_result(
         return rows
 
     moments = ((False, interval.start, interval.x0), (True, interval.end, interval.x1))
+    summary = read_summary(fields, interval, names)
     intersections = proximities = None
     if "edges_through_faces" in fields:
         start, end = (
@@ -272,8 +273,9 @@ def read_result(
                 **_read_pairs(interval, rows_at(is_end, "edges_through_faces", "inside"), names, _INTERSECTIONS),
                 time=time,
                 x=x,
+                ignored=at.ignored,
             )
-            for is_end, time, x in moments
+            for at, (is_end, time, x) in zip(summary.intersections or (), moments, strict=True)
         )
         intersections = start, end
     if "proximity_pairs" in fields:
@@ -284,7 +286,7 @@ def read_result(
             for is_end, time, _ in moments
         )
         proximities = start, end
-    rows, summary = fields["contacts"], read_summary(fields, interval, names)
+    rows = fields["contacts"]
     contacts = SceneContacts(
         **_read_pairs(interval, rows, names, _CONTACTS + _COMPARISON * bool(intersections)),
         interval=interval,

@@ -10,12 +10,11 @@ import numpy as np
 
 from ..usd.scene import Scene
 from .baseline import Baseline, Event, NewFinding
-from .depths import DepthFinder
 from .html_page import block, fill_page, inert, shared_part, spread
 from .limit import not_listed
 from .outputs import RecordFile
-from .report_data import MAX_PAIRS, Depths, report_data, report_title
-from .results import IntersectionSummary, IntervalResult
+from .report_data import MAX_PAIRS, report_data, report_title
+from .results import IntervalResult
 from .scene_contacts import SceneContacts
 from .scene_intersections import SceneIntersections
 from .scene_pairs import CROSSES, INSIDE, ScenePairs
@@ -30,7 +29,7 @@ _COLUMNS = ("first", "second", "elements", "first_0", "first_1", "second_0", "se
 
 _SCRIPTS = (
     "blocks.js", "rows.js", "elements.js", "table.js", "meshes.js", "view3d.js", "shaders.js", "view_data.js",
-    "cameras.js", "viewer.js", "timeline.js", "findings.js", "page.js",
+    "cameras.js", "viewer.js", "timeline.js", "findings.js", "meant.js", "page.js",
 )  # fmt: skip
 
 _WHY_NO_CAMERA = f"their views are not valid, or there are more than {_MOST_CAMERAS}"
@@ -58,8 +57,6 @@ class ReportPage(RecordFile):
         self._baseline = baseline
         self._most_rows = int(np.clip(_ALL_ROWS // (2 * len(scene)), _FEWEST_ROWS, _MOST_ROWS))
         self._views = ViewBlocks(len(scene))
-        self._depth_finder = DepthFinder()
-        self._depths: list[tuple[float, dict[tuple[str, str], float]]] = []  # time and depths at each interval's start
         self._meshes: dict[str, int] = {}  # number of each mesh, by its name
         self._facts: list[dict] = []  # name of each, whether it moves, and the prim's path if that is another one
         self._center: np.ndarray | None = None  # of all positions in the page
@@ -96,8 +93,6 @@ class ReportPage(RecordFile):
         positions = [contacts.position, *(found.position for found in (*at_rest, *near))]
         if index == 0 or sum(map(len, positions)):
             yield from self._views.of(result, np.concatenate(positions), numbers, center)
-        at_start = result.summary.intersections[0] if result.summary.intersections else None
-        self._depths[index:] = [(interval.start, self._find_depths(at_rest[0], at_start) if at_rest else {})]
         self._rows[index:] = [(len(rows), rest_rows, near_rows)]
         self._last = [(name, found[1]) for name, found in (("rest", at_rest), ("near", near)) if found]
 
@@ -110,7 +105,7 @@ class ReportPage(RecordFile):
                 numbers = np.array([self._meshes[mesh.name] for mesh in last.segment.meshes])
                 counts[name], more = self._at_rest(name, len(intervals), last, numbers)
                 text += more
-        data = report_data(summary, self._largest_depths(summary), self._baseline)
+        data = report_data(summary, self._baseline)
         data["rows"] = [*self._rows[: len(intervals)], (0, counts["rest"], counts["near"])]
         data["meshes"] = self._facts
         data["center"] = self._center.tolist() if self._center is not None else [0.0, 0.0, 0.0]
@@ -182,23 +177,6 @@ class ReportPage(RecordFile):
             facts |= {"curves": len(found.cuts.points), "curve_step": step}
         return len(rows), block(f"{name}-{index}", facts, arrays)
 
-    def _find_depths(self, found: SceneIntersections, counted: IntersectionSummary | None) -> dict:
-        """Returns the depths of meshes at a time; none where a limit leaves some of the intersections out."""
-        assert counted is not None
-        count = counted.crossings + counted.touches + sum(counted.inside.values())
-        return self._depth_finder.find(found) if len(found) == count else {}
-
-    def _largest_depths(self, summary: Summary) -> Depths:
-        """Returns the largest depth of each two meshes and the first time with it, of the intervals in the page."""
-        at_end = [found for _, found in self._last if isinstance(found, SceneIntersections)]
-        last = [(found.time, self._find_depths(found, summary.intersections[-1])) for found in at_end]
-        largest: Depths = {}
-        for time, depths in [*self._depths[: len(summary.intervals)], *last]:
-            for meshes, depth in depths.items():
-                if meshes not in largest or depth > largest[meshes][0]:
-                    largest[meshes] = depth, time
-        return largest
-
     def _cameras(self, summary: Summary, center: list[float]) -> tuple[str, list[dict], int]:
         """Returns the blocks of the scene's cameras, their facts, and the number of cameras left out."""
         scene = summary.scene
@@ -236,8 +214,6 @@ class ReportPage(RecordFile):
         limited = (missing.collisions[0], missing.intersections[0], missing.proximities[0]) if missing else (0, 0, 0)
         if missing and any(limited):
             notes.append(f"{missing} This holds for other files of the replay, and the views in 3D, as well.")
-        if limited[1]:
-            notes.append("Meshes have no depth at times at which intersections are not listed.")
         found = summary.hits - limited[0], rest - limited[1], near - limited[2]
         for name, listed, shown in zip(names, found, zip(*rows, strict=True), strict=True):
             if sum(shown) < listed:
@@ -252,10 +228,7 @@ class ReportPage(RecordFile):
         pairs = len({tuple(sorted(span.meshes)) for span in spans})
         if pairs > MAX_PAIRS:
             notes.append(f"The page has {MAX_PAIRS:,} of {pairs:,} pairs of meshes, those with the most collisions.")
-        if ignored := summary.ignored:
-            hits = sum(hits for _, hits in ignored)
-            notes.append(f"{hits:,} collisions of {len(ignored):,} ignored pairs of meshes are left out.")
-        return notes
+        return [*notes, summary.not_counted] if summary.not_counted else notes
 
 
 def _choose_rows(pairs: ScenePairs, most: int) -> np.ndarray:

@@ -1,11 +1,12 @@
-"""The data of a replay's page beside its blocks: title, numbers, charts, pairs of meshes, facts."""
+"""What a replay says of a whole scene: whether it is broken, by which pairs of meshes, and the data of its page."""
 
 from collections.abc import Iterable
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from ..usd.scene import Scene
 from .baseline import Baseline, NewFinding
-from .summary import CERTIFIED_FOR, Summary
+from .summary import CERTIFIED_FOR, CollisionSpan, IntersectionSpan, ProximitySpan, Summary
 
 MAX_PAIRS = 10_000
 """Largest number of pairs of meshes in the page."""
@@ -14,21 +15,107 @@ _MAX_ROWS = 10  # of the small tables
 _MAX_DISAGREEMENTS = 200
 _MAX_NAMES = 100  # of duplicates
 
-Depths = dict[tuple[str, str], tuple[float, float]]
-"""The largest depth of two meshes and its time, by their sorted names."""
-
 
 def report_title(scene: Scene) -> str:
     """Returns the title of the page."""
     return f"Collisions in {Path(scene.path).name}"
 
 
-def report_data(summary: Summary, depths: Depths, baseline: Baseline | None) -> dict:
+@dataclass(frozen=True)
+class PairFindings:
+    """Two meshes that collide, intersect or are near each other at some time of a replay, or one that does so itself.
+
+    Attributes:
+        meshes: Names of the two, sorted.
+        collisions: The times over which they collide.
+        intersections: The times over which they intersect.
+        proximities: The times over which they are near each other.
+        is_initial: Whether they intersect at the first time already.
+        depth: The largest depth, in the scene's unit of length, and the first time with it; None if it is not known.
+    """
+
+    meshes: tuple[str, str]
+    collisions: list[CollisionSpan]
+    intersections: list[IntersectionSpan]
+    proximities: list[ProximitySpan]
+    is_initial: bool
+    depth: tuple[float, float] | None
+
+    @property
+    def hits(self) -> int:
+        """Number of their pairs that collide."""
+        return sum(span.hits for span in self.collisions)
+
+    @property
+    def edges(self) -> int:
+        """Largest number of edges of one that meet faces of the other at a time."""
+        return max((span.most for span in self.intersections if not span.inside), default=0)
+
+
+def pairs_of_meshes(summary: Summary) -> list[PairFindings]:
+    """Returns the pairs of meshes that collide, intersect or are near each other.
+
+    First come those that begin after the first time, then those that intersect at the first time already, then those
+    that are only near each other; in each the deepest first, then those with the most collisions.
+    """
+    spans: dict[tuple[str, str], tuple[list, list, list]] = {}
+    found = summary.collision_spans, summary.intersection_spans, summary.proximity_spans
+    for which, own in enumerate(found):
+        for span in own:
+            spans.setdefault((min(span.meshes), max(span.meshes)), ([], [], []))[which].append(span)
+    first = summary.intersections[0] if summary.intersections else None
+    initial = {(min(meshes), max(meshes)) for meshes in (*first.mesh_pairs, *first.inside)} if first else set()
+    pairs = [PairFindings(key, *own, key in initial, summary.depths.get(key)) for key, own in spans.items()]
+
+    def rank(pair: PairFindings) -> tuple:
+        is_only_near = not pair.collisions and not pair.intersections
+        return is_only_near, pair.is_initial, -(pair.depth or (0.0,))[0], -pair.hits, pair.meshes
+
+    return sorted(pairs, key=rank)
+
+
+def length(scene: Scene, distance: float) -> str:
+    """Returns a distance in centimetres, by the scene's unit of length; of mesh files, which have none, as it is."""
+    return f"{distance:.3g}" if scene.stage is None else f"{100.0 * distance * scene.meters_per_unit:.3g} cm"
+
+
+def verdict(summary: Summary) -> str:
+    """Returns a sentence that says whether a scene is broken, by how many pairs of meshes, and which is the worst."""
+    if sentence := _nothing_found(summary):
+        return sentence
+    pairs = [pair for pair in pairs_of_meshes(summary) if pair.collisions or pair.intersections]
+    later = sum(not pair.is_initial for pair in pairs)
+    inverting = len({span.meshes for span in summary.inversion_spans})
+    same = len({name for span in summary.duplicate_spans for name in span.meshes})
+    verb = "collides or intersects" if len(pairs) == 1 else "collide or intersect"
+    parts = [f"{len(pairs):,} {_plural('pair', len(pairs))} of meshes {verb}"] * bool(pairs)
+    if later < len(pairs):
+        parts[0] += f", {later:,} of them only after the first time" if later else ", at the first time already"
+    parts += [f"tetrahedra of {inverting:,} {_plural('mesh', inverting, 'es')} invert"] * bool(inverting)
+    is_broken = bool(parts)
+    parts += [f"{same:,} meshes are duplicates"] * bool(same)
+    if near := len(summary.nearest):
+        parts.append(f"within {summary.clearance:g} of each other: {near:,} {_plural('pair', near)} of meshes")
+    if not parts:
+        return ""  # nothing was checked, or not all of it
+    text = f"{'Broken' if is_broken else 'Not broken, but'}: {'; '.join(parts)}."
+    if pairs:
+        (first, second), worst = pairs[0].meshes, pairs[0]
+        depth, spans = worst.depth[0] if worst.depth else 0.0, [*worst.collisions, *worst.intersections]
+        hits = f"{worst.hits:,} {_plural('collision', worst.hits)}"
+        since, until = min(span.since for span in spans), max(span.until for span in spans)
+        deep, when = f"{length(summary.scene, depth)} deep" if depth else hits, f"time {since:g}"
+        when += f" to {until:g}" * (until > since)
+        of_these = " of these" * (0 < later < len(pairs))
+        text += f" The worst{of_these}: {first} with {'itself' if first == second else second}, {deep}, {when}."
+    return text
+
+
+def report_data(summary: Summary, baseline: Baseline | None) -> dict:
     """Returns the data of the whole replay that the page's script shows.
 
     Args:
         summary: The replay.
-        depths: The depth of each two meshes that intersect.
         baseline: The earlier replay with which the page compares; None without one.
     """
     new = None if baseline is None else baseline.new_in(summary)
@@ -41,7 +128,7 @@ def report_data(summary: Summary, depths: Depths, baseline: Baseline | None) -> 
         (f"{summary.hits:,}", "collisions"),
         (f"{len(summary.colliding):,} of {len(summary.intervals):,}", "intervals with collisions"),
     ]
-    if first := summary.first_contact:
+    if summary.colliding and (first := summary.colliding[0].earliest):
         tiles.append((f"{first.time:.6g}", "time code of the first"))
     if looked:
         tiles.append((f"{intersecting:,} of {len(summary.intersections):,}", "times with intersections at rest"))
@@ -49,8 +136,8 @@ def report_data(summary: Summary, depths: Depths, baseline: Baseline | None) -> 
         tiles.append((f"{len({name for span in spans for name in span.meshes}):,}", "meshes that are duplicates"))
     if inversions := summary.inversion_spans:
         tiles.append((f"{len({span.meshes for span in inversions}):,}", "meshes with inverted tetrahedra"))
-    if depths:
-        tiles.append((f"{max(depth for depth, _ in depths.values()):.4g}", "largest depth"))
+    if depths := summary.depths:
+        tiles.append((length(scene, max(depth for depth, _ in depths.values())), "largest depth"))
     if summary.clearance is not None:
         nearest = summary.nearest
         tiles.append((f"{nearest[0].distance:.4g}" if nearest else f"> {summary.clearance:g}", "smallest distance"))
@@ -65,6 +152,7 @@ def report_data(summary: Summary, depths: Depths, baseline: Baseline | None) -> 
         f"{summary.device}",
         "partial": "",
         "nothing": _nothing_found(summary),
+        "verdict": verdict(summary),
         "is_whole": not summary.not_checked,
         "tiles": tiles,
         "intervals": [
@@ -80,7 +168,9 @@ def report_data(summary: Summary, depths: Depths, baseline: Baseline | None) -> 
         "rest": [(at.time, at.crossings, at.touches, sum(at.inside.values())) for at in summary.intersections],
         "near": [(at.time, at.pairs) for at in summary.proximities],
         "toi": summary.toi_counts,
-        "pairs": _pairs_of_meshes(summary, depths, new or ()),
+        "pairs": _pairs_of_meshes(summary, new or ()),
+        **_triage(summary),
+        "centimetres": None if scene.stage is None else 100.0 * scene.meters_per_unit,
         "has_baseline": new is not None,
         "up_axis": scene.up_axis,
         "facts": [
@@ -121,6 +211,20 @@ def report_data(summary: Summary, depths: Depths, baseline: Baseline | None) -> 
     return data
 
 
+def _triage(summary: Summary) -> dict:
+    """Returns what is meant to meet, and what is ignored: entries with their numbers of collisions, and both sums."""
+    scene, ignored = summary.scene, summary.ignored
+    hits = [sum(pair.hits for pair in ignored if pair.meant == entry) for entry in scene.selection.triage]
+    entries = [asdict(entry) | {"hits": number} for entry, number in zip(scene.selection.triage, hits, strict=True)]
+    others = [pair for pair in ignored if pair.meant is None]
+    return {
+        "triage": None if scene.stage is None else entries,
+        "triage_name": f"{Path(scene.path).stem}.triage.json",
+        "ignored": [{"meshes": pair.meshes, "hits": pair.hits, "reason": "ignored by an option"} for pair in others],
+        "ignored_counts": (len(ignored), sum(pair.hits for pair in ignored)),
+    }
+
+
 def _nothing_found(summary: Summary) -> str:
     """Returns a sentence on what was checked if nothing was found in a whole replay, else an empty text."""
     found = (
@@ -135,6 +239,7 @@ def _nothing_found(summary: Summary) -> str:
         return ""  # nothing was checked
     scene, at_rest = summary.scene, len(summary.intersections)
     what = ["Nothing collides"] * (not scene.is_still) + ["nothing intersects"] * bool(at_rest)
+    what += ["no tetrahedron inverts"] * any(scene.prim_of(name).has_tetrahedra for name in scene.names)
     if summary.clearance is not None:
         what.append(f"nothing is within {summary.clearance:g} of another")
     times = f"time {scene.times[0]:g}" if scene.is_still else f"time {scene.times[0]:g} to {scene.times[-1]:g}"
@@ -149,11 +254,9 @@ def _nothing_found(summary: Summary) -> str:
     text += f", certified for {CERTIFIED_FOR}." if summary.certified else ", not certified: collisions may be missing."
     if not at_rest:
         text += " Intersections at rest were not checked."
-    if hits := sum(hits for _, hits in summary.ignored):
-        text += f" Left out: {hits:,} {_plural('collision', hits)} of ignored pairs."
+    text += f" {summary.not_counted}" if summary.not_counted else ""
     text += f" {summary.not_checked}" if summary.not_checked else ""
-    selection = scene.selection
-    if selection.between or selection.ignore or selection.ignored_names or not selection.self_collisions:
+    if scene.selection.chooses_pairs:
         text += " Only some pairs of meshes were checked, as options say."
     return text
 
@@ -162,44 +265,28 @@ def _plural(word: str, count: int, ending: str = "s") -> str:
     return word if count == 1 else word + ending
 
 
-def _pairs_of_meshes(summary: Summary, depths: Depths, new: Iterable[NewFinding]) -> list[dict]:
-    """Returns the pairs of meshes with collisions, intersections or proximities, and the spans of time of each kind.
+def _pairs_of_meshes(summary: Summary, new: Iterable[NewFinding]) -> list[dict]:
+    """Returns :func:`pairs_of_meshes` with the spans of time of each kind, for the page.
 
-    ``new`` is what a baseline does not contain.
-
-    The deepest come first, then those with the most collisions. A pair has at most :data:`_MAX_ROWS` spans of each
-    kind; the numbers ``more`` count the others.
+    A pair has at most :data:`_MAX_ROWS` spans of each kind; the numbers ``more`` count the others. ``new`` is what a
+    baseline does not contain.
     """
-    hits = {(min(meshes), max(meshes)): count for meshes, count in summary.mesh_pairs}
-    spans: dict[tuple[str, str], tuple[tuple[str, str], list, list, list]] = {}
-
-    def spans_of(meshes: tuple[str, str]) -> tuple[tuple[str, str], list, list, list]:
-        return spans.setdefault((min(meshes), max(meshes)), (meshes, [], [], []))
-
-    for span in summary.collision_spans:
-        spans_of(span.meshes)[1].append((span.since, span.until, span.hits))
-    for span in summary.intersection_spans:
-        inner = span.meshes[0] if span.inside else ""
-        spans_of(span.meshes)[2].append((span.since, span.until, span.most, span.trend, inner))
-    for span in summary.proximity_spans:
-        spans_of(span.meshes)[3].append((span.since, span.until, span.distance))
     new_of: dict[tuple[str, str], list[tuple[str, float, float]]] = {}
     for what, meshes, start, end in new:
         new_of.setdefault((min(meshes), max(meshes)), []).append((what, start, end))
-    order = sorted(spans, key=lambda key: (-depths.get(key, (0.0, 0.0))[0], -hits.get(key, 0)))
-    return [_pair(spans[key], hits.get(key, 0), depths.get(key), new_of.get(key, [])) for key in order[:MAX_PAIRS]]
+    return [_pair(pair, new_of.get(pair.meshes, [])) for pair in pairs_of_meshes(summary)[:MAX_PAIRS]]
 
 
-def _pair(
-    spans: tuple[tuple[str, str], list, list, list], hits: int, depth: tuple[float, float] | None, new: list
-) -> dict:
-    meshes, collisions, at_rest, near = spans
-    pair: dict = {"meshes": meshes, "hits": hits, "depth": depth}
-    for name, more, rows in (
-        ("spans", "more", collisions),
-        ("rest", "more_rest", at_rest),
-        ("near", "more_near", near),
-        ("new", "more_new", new),
-    ):
-        pair |= {name: rows[:_MAX_ROWS], more: max(0, len(rows) - _MAX_ROWS)}
-    return pair
+def _pair(pair: PairFindings, new: list) -> dict:
+    lists = {
+        "spans": [(span.since, span.until, span.hits) for span in pair.collisions],
+        "rest": [
+            (span.since, span.until, span.most, span.trend, span.meshes[0] if span.inside else "")
+            for span in pair.intersections
+        ],
+        "near": [(span.since, span.until, span.distance) for span in pair.proximities],
+        "new": new,
+    }
+    more = {f"more_{name}": max(0, len(found) - _MAX_ROWS) for name, found in lists.items()}
+    facts = {"meshes": pair.meshes, "hits": pair.hits, "depth": pair.depth, "is_initial": pair.is_initial}
+    return facts | {name: found[:_MAX_ROWS] for name, found in lists.items()} | more

@@ -9,6 +9,7 @@ from ..detection.inversions import Inversions
 from ..detection.results.collisions import DetectionStats, PhaseCounts
 from ..detection.run.settings import PairKind
 from ..usd.interval import Interval
+from ..usd.selection import Meant
 from .scene_contacts import SceneContacts
 from .scene_intersections import SceneIntersections
 from .scene_pairs import KINDS, PHASES, count_by_meshes
@@ -57,6 +58,7 @@ class IntersectionSummary:
             that intersects itself.
         inside: Number of connected parts of a mesh that are wholly inside another mesh, by the name of the inner mesh
             and that of the outer one.
+        ignored: Number of edges that meet faces and are ignored, by the names of the two meshes, in the scene's order.
     """
 
     time: float
@@ -64,11 +66,36 @@ class IntersectionSummary:
     touches: int
     mesh_pairs: dict[tuple[str, str], tuple[int, int]]
     inside: dict[tuple[str, str], int]
+    ignored: dict[tuple[str, str], int]
 
     @property
     def is_empty(self) -> bool:
         """Whether nothing intersects."""
         return not self.mesh_pairs and not self.inside
+
+
+@dataclass(frozen=True)
+class IgnoredPair:
+    """Two meshes whose collisions and intersections are only counted.
+
+    Attributes:
+        meshes: Names of the two, sorted.
+        hits: Number of their pairs that collide.
+        edges: Largest number of edges of one that meet faces of the other at a time.
+        meant: The entry of the triage by which they are meant to meet; None if an option ignores them.
+    """
+
+    meshes: tuple[str, str]
+    hits: int
+    edges: int
+    meant: Meant | None
+
+    def __str__(self) -> str:
+        """Returns the numbers, the meshes and the reason, in words."""
+        first, second = self.meshes
+        edges = f", at most {self.edges:,} edges in faces" * bool(self.edges)
+        reason = f": {self.meant}" if self.meant else ""
+        return f"{self.hits:,} of {first} with {'itself' if first == second else second}{edges}{reason}"
 
 
 @dataclass(frozen=True)
@@ -330,6 +357,7 @@ def summarize_intersections(found: SceneIntersections) -> IntersectionSummary:
         found.touches,
         {names: (a, b) for names, (a, b) in by_meshes.items()},
         dict(inside),
+        found.ignored,
     )
 
 

@@ -23,6 +23,7 @@ from .scene_pairs import (
     TOUCHES,
     VERTEX,
     ScenePairs,
+    count_by_meshes,
     take_rows,
 )
 
@@ -55,11 +56,13 @@ class SceneIntersections(ScenePairs):
         time: Time code.
         crosses: Whether an edge passes through the face, bool, shape [n]; edges that do not, touch it.
         x: Positions of all vertices at that time, shape [vertex_count, 3].
+        ignored: Number of edges that meet faces and are ignored, by the names of the two meshes, in the scene's order.
     """
 
     time: float
     crosses: np.ndarray
     x: np.ndarray = field(repr=False)
+    ignored: dict[tuple[str, str], int] = field(default_factory=dict)
 
     BY_PAIR: ClassVar[tuple[str, ...]] = (*ScenePairs.BY_PAIR, "crosses")
 
@@ -172,8 +175,10 @@ def name_intersections(
     edge_meshes, points, diagonal = segment.locate_edges(ends)
     face_meshes, polygons = segment.locate_faces(faces)
     meshes = np.stack([edge_meshes, face_meshes], axis=1)
-    counted = selection.counted_pairs(segment.meshes, meshes) & ~selection.ignored_pairs(segment.meshes, meshes)
-    counted &= ~segment.are_stiff(ends, face_meshes)
+    counted = selection.counted_pairs(segment.meshes, meshes) & ~segment.are_stiff(ends, face_meshes)
+    ignored = counted & selection.ignored_pairs(segment.meshes, meshes)
+    counted &= ~ignored
+    of_ignored = {names: number for names, (number,) in count_by_meshes(segment, meshes[ignored]).items()}
     nowhere = np.full_like(faces, -1)
     arrays = {
         "kind": np.full(len(faces), _EDGE_FACE),
@@ -189,7 +194,7 @@ def name_intersections(
     if len(inside.bodies):
         of_inside = _name_inside(segment, inside, x)
         arrays = {name: np.concatenate([array, of_inside[name]]) for name, array in arrays.items()}
-    return SceneIntersections(segment, **arrays, time=time, x=x)
+    return SceneIntersections(segment, **arrays, time=time, x=x, ignored=of_ignored)
 
 
 def _name_inside(segment: Segment, inside: Containment, x: np.ndarray) -> dict[str, np.ndarray]:

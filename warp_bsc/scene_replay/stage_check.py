@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from ..usd.frames import FrameRange
+from ..usd.read.triage import select_by_triage
 from ..usd.scene import Scene
 from .intervals import replay
 from .summary import Summary
@@ -17,12 +18,13 @@ class StageIssue:
 
     Attributes:
         kind: What it is: ``"Inside"``, a mesh wholly inside another, and ``"Duplicates"`` may be meant.
-            ``"Unreadable"`` is a part that is not checked, or the whole stage.
+            ``"Unreadable"`` is a part that is not checked, or the whole stage. ``"Meant"`` is no issue: it says which
+            triage file was read, and what is not counted because of it.
         text: What is found between which prims, and when.
         prims: Paths of the prims.
     """
 
-    kind: Literal["Collision", "Intersection", "Inversion", "Inside", "Duplicates", "Unreadable"]
+    kind: Literal["Collision", "Intersection", "Inversion", "Inside", "Duplicates", "Unreadable", "Meant"]
     text: str
     prims: tuple[str, ...] = ()
 
@@ -31,7 +33,7 @@ def check_stage(stage: Any, *, frames: FrameRange | None = None) -> list[StageIs
     """Returns an issue for each span of time in which two meshes collide, cross, coincide or one is inside another.
 
     The stage is replayed as it is composed, with edits that are not saved, by method ``"exact"`` on Warp's default
-    device.
+    device, without what its triage says is meant, see :func:`~warp_bsc.usd.read.triage.select_by_triage`.
 
     Args:
         stage: The stage, a ``Usd.Stage``.
@@ -40,7 +42,8 @@ def check_stage(stage: Any, *, frames: FrameRange | None = None) -> list[StageIs
     paths: dict[str, str] = {}  # by name
     intervals = []
     try:
-        scene = Scene(stage, frames=frames)
+        triage, selection = select_by_triage(stage)
+        scene = Scene(stage, selection=selection, frames=frames)
         for result in replay(scene):
             paths |= {mesh.name: mesh.path for mesh in result.contacts.segment.meshes}
             intervals.append(result.summary)
@@ -65,6 +68,9 @@ def check_stage(stage: Any, *, frames: FrameRange | None = None) -> list[StageIs
         add("Inversion", span, span.describe())
     for span in summary.duplicate_spans:
         add("Duplicates", span, span.describe(_MOST_NAMES))
+    if triage:
+        notes = [warning for warning in scene.warnings if warning.startswith("triage: ")]
+        issues.append(StageIssue("Meant", " ".join([f"{triage} was read.", summary.not_counted, *notes]).rstrip()))
     return issues
 
 

@@ -2,13 +2,13 @@
 
 import functools
 from collections import Counter
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TypeVar
 
 from ..usd.scene import Scene
-from .results import TOI_BINS, Contact, IntersectionSummary, IntervalSummary, Nearest, ProximitySummary
+from .results import TOI_BINS, IgnoredPair, IntersectionSummary, IntervalSummary, Nearest, ProximitySummary
 from .validation import Validation
 
 _Span = TypeVar("_Span")
@@ -158,6 +158,8 @@ class Summary:
         clearance: Distance up to which proximities were found, in the scene's unit of length; None without them.
         limit: Largest number of rows of each list of an interval in files, see :mod:`~warp_bsc.scene_replay.limit`;
             None if files list all.
+        depths: The largest depth of each two meshes that intersect, in the scene's unit of length, and the first time
+            with it, by their sorted names; empty if depths were not measured.
     """
 
     scene: Scene
@@ -167,6 +169,7 @@ class Summary:
     stopped: str = ""
     clearance: float | None = None
     limit: int | None = None
+    depths: Mapping[tuple[str, str], tuple[float, float]] = field(default_factory=dict)
 
     @property
     def is_complete(self) -> bool:
@@ -189,19 +192,24 @@ class Summary:
         return sorted(self.colliding, key=lambda interval: -interval.hits)
 
     @property
-    def first_contact(self) -> Contact | None:
-        """The earliest contact, None if there is none."""
-        return self.colliding[0].earliest if self.colliding else None
-
-    @property
     def hits(self) -> int:
         """Number of pairs that collide in some interval."""
         return sum(interval.hits for interval in self.intervals)
 
     @cached_property
-    def ignored(self) -> list[tuple[tuple[str, str], int]]:
-        """Names of two meshes and their number of colliding pairs that were ignored, the largest first."""
-        return self._largest("ignored")
+    def ignored(self) -> list[IgnoredPair]:
+        """The pairs of meshes that meet and are ignored, those with the most collisions first."""
+        hits, edges = Counter[tuple[str, str]](), Counter[tuple[str, str]]()
+        for interval in self.intervals:
+            hits.update({(min(meshes), max(meshes)): number for meshes, number in interval.ignored.items()})
+        for sample in self.intersections:
+            edges |= Counter({(min(meshes), max(meshes)): number for meshes, number in sample.ignored.items()})
+        selection, prim_of = self.scene.selection, self.scene.prim_of
+        pairs = (
+            IgnoredPair(meshes, hits[meshes], edges[meshes], selection.meant(*map(prim_of, meshes)))
+            for meshes in hits.keys() | edges.keys()
+        )
+        return sorted(pairs, key=lambda pair: (-pair.hits, -pair.edges, pair.meshes))
 
     @cached_property
     def collision_spans(self) -> list[CollisionSpan]:
@@ -305,20 +313,16 @@ class Summary:
     @cached_property
     def mesh_pairs(self) -> list[tuple[tuple[str, str], int]]:
         """Names of two meshes and their number of colliding pairs, the largest first."""
-        return self._largest("mesh_pairs")
+        total: Counter[tuple[str, str]] = Counter()
+        for interval in self.intervals:
+            total.update(interval.mesh_pairs)
+        return total.most_common()
 
     @property
     def toi_counts(self) -> list[int]:
         """Number of pairs by their time of impact, in equal parts of an interval."""
         counts = [interval.toi_counts for interval in self.intervals]
         return [sum(column) for column in zip(*counts, strict=True)] or [0] * TOI_BINS
-
-    def _largest(self, counts: str) -> list[tuple[tuple[str, str], int]]:
-        """Returns counts by two meshes of all intervals, the largest first."""
-        total: Counter[tuple[str, str]] = Counter()
-        for interval in self.intervals:
-            total.update(getattr(interval, counts))
-        return total.most_common()
 
     @property
     def validation(self) -> Validation | None:
@@ -352,6 +356,16 @@ class Summary:
         return text
 
     @property
+    def not_counted(self) -> str:
+        """A sentence on the pairs of meshes that are meant to meet, or ignored; empty without any."""
+        if not self.ignored:
+            return ""
+        meant, hits = sum(pair.meant is not None for pair in self.ignored), sum(pair.hits for pair in self.ignored)
+        kinds = [(meant, "meant"), (len(self.ignored) - meant, "ignored")]
+        pairs = " and ".join(_count(number, f"{kind} pair") for number, kind in kinds if number)
+        return f"Not counted: {pairs} of meshes, {_count(hits, 'collision')}."
+
+    @property
     def not_checked(self) -> str:
         """A sentence on the parts of the scene that are left out; empty if there are none."""
         parts = len(self.scene.left_out)
@@ -369,6 +383,10 @@ def _at_all_times(intervals: Iterable[tuple[_AtRest, _AtRest] | None]) -> list[_
     """Returns what is at the starts of intervals, and at the end of the last one."""
     found = [both for both in intervals if both]
     return [start for start, _ in found] + [end for _, end in found[-1:] if end.time != found[-1][0].time]
+
+
+def _count(number: int, one: str) -> str:
+    return f"{number:,} {one}{'s' * (number != 1)}"
 
 
 def _when(span: DuplicateSpan | InversionSpan) -> str:

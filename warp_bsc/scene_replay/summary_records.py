@@ -142,6 +142,7 @@ def _intersection_fields(found: IntersectionSummary, numbers: Mapping[str, int])
         "touches": found.touches,
         "mesh_pairs": pairs,
         "inside": inside,
+        "ignored": mesh_pairs_to_list(found.ignored.items(), numbers, "edges"),
     }
 
 
@@ -151,7 +152,8 @@ def _read_intersections(fields: dict[str, Any], names: list[str]) -> Intersectio
         for pair in fields["mesh_pairs"]
     }
     inside = _mesh_pairs_from_list(fields["inside"], names, "parts")
-    return IntersectionSummary(fields["time"], fields["crossings"], fields["touches"], pairs, inside)
+    ignored = _mesh_pairs_from_list(fields["ignored"], names, "edges")
+    return IntersectionSummary(fields["time"], fields["crossings"], fields["touches"], pairs, inside, ignored)
 
 
 def _proximity_fields(found: ProximitySummary, numbers: Mapping[str, int]) -> dict[str, Any]:

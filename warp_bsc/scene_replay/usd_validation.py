@@ -24,10 +24,17 @@ __all__ = ["NAME", "PLUGIN_FOLDER", "find_errors"]
 NAME = f"{__name__}:Collisions"
 """Name of the rule. Its errors are ``Collision``, ``Intersection``, ``Inversion`` (of tetrahedra), ``Unreadable`` for
 parts that are not checked; its warnings are ``Inside``, for a mesh that is wholly inside another, perhaps
-intentionally, and ``Duplicates``."""
+intentionally, and ``Duplicates``; ``Meant`` says which triage file was read, and what it says is meant."""
 
 PLUGIN_FOLDER = os.path.join(os.path.dirname(__file__), "plugin", "")
 """Folder of the plugin, for ``PXR_PLUGINPATH_NAME``."""
+
+
+_KINDS = {
+    "Inside": UsdValidation.ValidationErrorType.Warn,
+    "Duplicates": UsdValidation.ValidationErrorType.Warn,
+    "Meant": UsdValidation.ValidationErrorType.Info,
+}
 
 
 def find_errors(stage: Usd.Stage, time_range: UsdValidation.ValidationTimeRange) -> list[UsdValidation.ValidationError]:
@@ -45,8 +52,7 @@ def find_errors(stage: Usd.Stage, time_range: UsdValidation.ValidationTimeRange)
     bounds = (None if math.isinf(time) else time for time in (times.GetMin(), times.GetMax()))
     errors = []
     for issue in check_stage(stage, frames=FrameRange(*bounds)):
-        is_warning = issue.kind in ("Inside", "Duplicates")
-        kind = UsdValidation.ValidationErrorType.Warn if is_warning else UsdValidation.ValidationErrorType.Error
+        kind = _KINDS.get(issue.kind, UsdValidation.ValidationErrorType.Error)
         sites = [UsdValidation.ValidationErrorSite(stage, path) for path in issue.prims]
         errors.append(UsdValidation.ValidationError(issue.kind, kind, sites, issue.text))
     return errors

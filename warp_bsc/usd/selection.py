@@ -28,6 +28,27 @@ class NamedMesh(Protocol):
 
 
 @dataclass(frozen=True)
+class Meant:
+    """Meshes that are meant to meet, as an entry of a triage file says.
+
+    Attributes:
+        meshes: Patterns of two meshes, which are meant to meet each other, or of one, which may meet all others.
+        reason: Why, in words.
+        who: Who has said so.
+        date: When, such as "2026-11-29".
+    """
+
+    meshes: tuple[str, ...]
+    reason: str
+    who: str
+    date: str
+
+    def __str__(self) -> str:
+        """Returns the reason, and who has given it when."""
+        return f"{self.reason} ({self.who}, {self.date})"
+
+
+@dataclass(frozen=True)
 class Selection:
     """Selects the meshes of a scene, and the pairs of them, that are checked.
 
@@ -42,6 +63,8 @@ class Selection:
         between: Two patterns: only pairs of a mesh of the first and a mesh of the second are checked.
         purposes: Purposes of the meshes that are checked.
         ignore: Pairs of patterns: collisions of a mesh of the first and a mesh of the second are only counted.
+        triage: Meshes that are meant to meet, which are ignored in the same way, as
+            :func:`warp_bsc.read_triage` returns them.
         ignored_names: Pairs of names of meshes that are ignored in the same way, each pair sorted.
         ignored_inside: Pairs of names of a mesh and another one that it may be inside.
 
@@ -56,6 +79,7 @@ class Selection:
     between: tuple[str, str] | None = None
     purposes: tuple[Purpose, ...] = ("default", "render")
     ignore: tuple[tuple[str, str], ...] = ()
+    triage: tuple[Meant, ...] = ()
     ignored_names: frozenset[tuple[str, str]] = frozenset()
     ignored_inside: frozenset[tuple[str, str]] = frozenset()
 
@@ -70,6 +94,8 @@ class Selection:
         if self.between is not None:
             checked["between"] = _checked_pair(self.between, "between")
         checked["ignore"] = _checked_pairs(self.ignore, "ignore")
+        if not isinstance(self.triage, tuple) or not all(isinstance(entry, Meant) for entry in self.triage):
+            raise TypeError(f"triage must be a tuple of entries, as read_triage returns, not {given(self.triage)}")
         for name in ("ignored_names", "ignored_inside"):
             checked[name] = frozenset(_checked_pairs(getattr(self, name), name))
         for name, value in checked.items():
@@ -94,20 +120,35 @@ class Selection:
                 if not any(_matches(mesh, pattern) for mesh in meshes):
                     raise ValueError(f"{name}: no mesh matches {pattern}")
 
-    def unmatched(self, meshes: Sequence[NamedMesh]) -> list[tuple[str, str]]:
-        """Returns the pairs to ignore with a pattern that matches no mesh, given all meshes."""
-        return [pair for pair in self.ignore if not all(any(_matches(m, pattern) for m in meshes) for pattern in pair)]
+    @property
+    def chooses_pairs(self) -> bool:
+        """Whether some pairs of meshes may not be checked, or may be ignored."""
+        return bool(self.between or self.ignore or self.triage or self.ignored_names or not self.self_collisions)
+
+    def unmatched(self, meshes: Sequence[NamedMesh]) -> dict[str, list[tuple[str, ...]]]:
+        """Returns what is to be ignored and has a pattern that matches no mesh, by the attribute, given all meshes."""
+        named = {"ignore": self.ignore, "triage": [entry.meshes for entry in self.triage]}
+        return {
+            name: [
+                entry for entry in entries if not all(any(_matches(m, pattern) for m in meshes) for pattern in entry)
+            ]
+            for name, entries in named.items()
+        }
+
+    def meant(self, first: NamedMesh, second: NamedMesh) -> Meant | None:
+        """Returns the first entry of the triage by which two meshes are meant to meet, None without one."""
+        both, a, b = (first, second), np.array([0]), np.array([int(first.name != second.name)])
+        return next((entry for entry in self.triage if _are_of(entry.meshes, both, a, b).any()), None)
 
     def ignored_pairs(self, meshes: Sequence[NamedMesh], pairs: np.ndarray) -> np.ndarray:
         """Returns whether each pair of meshes is ignored; arguments and result as of :meth:`counted_pairs`."""
         ignored = np.zeros(len(pairs), dtype=bool)
-        if not (self.ignore or self.ignored_names) or not len(pairs):
+        if not (self.ignore or self.triage or self.ignored_names) or not len(pairs):
             return ignored
         used, rows = np.unique(pairs, return_inverse=True)
         a, b = rows.reshape(-1, 2).T
-        for patterns in self.ignore:
-            first, second = (np.array([_matches(meshes[mesh], pattern) for mesh in used]) for pattern in patterns)
-            ignored |= (first[a] & second[b]) | (first[b] & second[a])
+        for patterns in (*self.ignore, *(entry.meshes for entry in self.triage)):
+            ignored |= _are_of(patterns, [meshes[mesh] for mesh in used], a, b)
         if self.ignored_names:
             keys, rows = np.unique(np.sort(pairs, axis=1) @ np.array([len(meshes), 1]), return_inverse=True)
             names = (sorted(meshes[number].name for number in divmod(key, len(meshes))) for key in keys.tolist())
@@ -134,9 +175,7 @@ class Selection:
         if not self.self_collisions:
             counted &= pairs[:, 0] != pairs[:, 1]
         if self.between:
-            first, second = (np.array([_matches(mesh, pattern) for mesh in meshes]) for pattern in self.between)
-            a, b = pairs.T
-            counted &= (first[a] & second[b]) | (first[b] & second[a])
+            counted &= _are_of(self.between, meshes, *pairs.T)
         return counted
 
 
@@ -151,6 +190,23 @@ def _checked_pairs(values, name) -> tuple[tuple[str, str], ...]:
     if isinstance(values, str) or not isinstance(values, Iterable):
         raise TypeError(f"{name} must be pairs of strings, not {given(values)}")
     return tuple(_checked_pair(pair, name) for pair in values)
+
+
+def _are_of(patterns: tuple[str, ...], meshes: Sequence[NamedMesh], a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Returns which pairs are of a mesh of the first pattern and one of the second, bool, shape [n].
+
+    With a single pattern they are of two meshes, at least one of which matches it.
+
+    Args:
+        patterns: The patterns, one or two.
+        meshes: The meshes.
+        a: Index of one mesh of each pair, shape [n].
+        b: Index of the other, shape [n].
+    """
+    first, last = (np.array([_matches(mesh, pattern) for mesh in meshes]) for pattern in (patterns[0], patterns[-1]))
+    if len(patterns) == 1:
+        return (first[a] | first[b]) & (a != b)
+    return (first[a] & last[b]) | (first[b] & last[a])
 
 
 def _matches(mesh, pattern) -> bool:

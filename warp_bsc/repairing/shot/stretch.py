@@ -9,6 +9,10 @@ from ...usd.write.points_layer import MovedFrame
 _GOOD_EDGES = 1.0 / 3.0, 2.0
 """Smallest and largest length of an edge in a frame that is good, as shares of its length in the shot."""
 
+_SHORTEST_EDGE = 1e-3
+"""Length of an edge in the shot, as a share of the median one, up to which it does not count: when it moves at all, it
+is shorter or longer by any factor."""
+
 
 @dataclass(frozen=True)
 class RepairedStretch:
@@ -23,7 +27,8 @@ class RepairedStretch:
         largest_move: The largest of all these.
         mean_move: Mean of the distances of moved vertices.
         edge_length: Median edge length of the meshes that may move, at the start.
-        edge_ratios: Smallest and largest length of an edge in each of the frames, as shares of its length in the shot.
+        edge_ratios: Smallest and largest length of an edge in each of the frames, as shares of its length in the shot,
+            without edges that are shorter in the shot than a thousandth of ``edge_length``.
         acceleration: Largest second difference of the displacement of a vertex over three frames, and of its position
             in the shot, in the unit of length.
         uncertified: Times of the frames whose motion from the frame before is not certified.
@@ -139,7 +144,8 @@ class StretchRecorder:
         self._sum, self._count = self._sum + float(moves.sum(dtype=np.float64)), self._count + len(moves)
         edges = self._mesh.edges
         lengths = [np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1) for x in (frame.x, frame.given)]
-        ratio = lengths[0] / np.maximum(lengths[1], 1e-12 * self._mesh.length)
+        counts = lengths[1] > _SHORTEST_EDGE * self._mesh.length
+        ratio = lengths[0][counts] / lengths[1][counts]
         self._ratios.append((float(ratio.min(initial=1.0)), float(ratio.max(initial=1.0))))
 
     def finish(self, reasons: list[str]) -> RepairedStretch:

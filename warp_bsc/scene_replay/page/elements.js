@@ -121,7 +121,7 @@ function addBars(parent, bars, classes, width, xLabel, height = 230, least = 46)
     add(chart, "line", { class: "grid", x1: left, x2: width - right, y1: y(value), y2: y(value) });
     add(chart, "text", { x: left - 7, y: y(value) + 4, "text-anchor": "end" }, count(value));
   }
-  const stepX = xLabel ? niceStep(high - low, width / 110) : Infinity;
+  const stepX = xLabel ? niceStep(high - low, width / 80) : Infinity;
   for (let at = Math.ceil(low / stepX - 1e-9); at * stepX <= high + 1e-9 * stepX; at += 1) {
     const options = { x: x(at * stepX), y: height - bottom + 17, "text-anchor": "middle" };
     add(chart, "text", options, short(at * stepX));

@@ -13,6 +13,9 @@ function addPrim(parent, mesh) {
   return link;
 }
 
+// Whether some pairs of meshes intersect at the first time already, and others begin later.
+const isMixed = new Set(data.pairs.map((pair) => pair.is_initial)).size > 1;
+
 function fillTable() {
   const side = (title, mesh, isSecond) => ({
     title,
@@ -38,7 +41,7 @@ function fillTable() {
       if (rows.phase[row] >= 0) cell.textContent = PHASES[rows.phase[row]] + (rows.separate[row] === 1 ? ", separate before" : "");
     } },
   ];
-  table = new LongTable(byId("rows"), columns, matchMedia("(max-width: 760px)").matches ? 66 : 44, showRow);
+  table = new LongTable(byId("rows"), columns, isNarrow ? 66 : 44, showRow, { index: isMixed ? -1 : 0, way: 1 });
   KINDS.forEach((text, kind) => { if (rows.kind.includes(kind)) add(byId("kind"), "option", { value: kind }, text); });
 }
 
@@ -89,7 +92,9 @@ function filterRows() {
   const words = state.text.toLowerCase().split(/\s+/).filter(Boolean);
   const names = data.meshes.map(({ name }) => name.toLowerCase());
   const selected = state.prims.map((name) => data.meshes.findIndex((mesh) => mesh.name === name));
-  const found = [];
+  const initial = new Set(data.pairs.filter((pair) => pair.is_initial).map(({ meshes }) => pairKey(...meshes.map((name) => meshNumbers.get(name)))));
+  const found = [], old = []; // those of pairs that meet at the first time already come last
+  let meant = 0;
   for (let row = 0; row < rows.count; row += 1) {
     const [first, second] = [rows.first[row], rows.second[row]];
     if (state.kind !== "" && rows.kind[row] !== Number(state.kind)) continue;
@@ -100,17 +105,19 @@ function filterRows() {
       const text = `${names[first]} ${elementText(rows, row, false)} ${names[second]} ${elementText(rows, row, true)}`;
       if (!words.every((word) => text.includes(word))) continue;
     }
-    found.push(row);
+    if (isMeant(first, second)) meant += 1;
+    else (initial.has(pairKey(first, second)) ? old : found).push(row);
   }
+  const later = found.length && old.length ? `, those of pairs that begin after the first time first` : "";
+  for (const row of old) found.push(row);
   table.show(found);
   byId("save-csv").disabled = byId("copy-paths").disabled = !found.length;
   const all = data.intervals.reduce((sum, _, index) => sum + hitsIn(index), 0) + data.rest.reduce((sum, _, index) => sum + restAt(index), 0) + data.near.reduce((sum, at) => sum + at[1], 0);
-  byId("rows-count").textContent = `${count(found.length)} of ${plural(rows.count, "row")}${rows.count < all ? `; ${count(all)} were found, see the notes` : ""}`;
+  byId("rows-count").textContent = `${count(found.length)} of ${plural(rows.count, "row")}${rows.count < all ? `; ${count(all)} were found, see the notes` : ""}${later}${meant ? `; ${plural(meant, "more is meant", "more are meant")}` : ""}`;
 }
 
 function fillPairs() {
-  const numbers = new Map(data.meshes.map(({ name }, index) => [name, index]));
-  const pairs = data.pairs;
+  const numbers = meshNumbers, pairs = data.pairs;
   const range = (since, until) => (since === until ? `at ${short(since)}` : `${short(since)} to ${short(until)}`);
   const fillSpans = (cell, texts, more) => add(cell, "span", { class: "clip" }, texts.join("; ") + (more ? `; ${count(more)} more` : ""));
   const columns = [
@@ -122,17 +129,19 @@ function fillPairs() {
       const tools = add(cell, "span", { class: "tools" });
       if (pairs[row].new.length) add(tools, "span", { class: "new", title: "Not in the baseline" }, "new");
       add(tools, "a", { class: "element", href: addressOf(-1, first === second ? [first] : [first, second]) }, "Rows");
-      addMeshButtons(tools, [...new Set([numbers.get(first), numbers.get(second)])]);
+      if (pairs[row].is_initial) add(tools, "span", { class: "element" }, "from the start");
+      const both = [numbers.get(first), numbers.get(second)];
+      addMeantButton(addMeshButtons(tools, [...new Set(both)]), both);
     } },
     { title: "Depth", number: true, class: "narrow", key: (row) => pairs[row].depth?.[0] ?? -1, fill: (cell, row) => {
       if (!pairs[row].depth) return;
       const [depth, time] = pairs[row].depth;
-      add(cell, "span", {}, short(Number(depth.toPrecision(4))));
+      add(cell, "span", {}, data.centimetres ? `${short(Number((depth * data.centimetres).toPrecision(3)))} cm` : short(Number(depth.toPrecision(4))));
       add(cell, "span", { class: "muted" }, `at ${short(time)}`);
     } },
     { title: "Collisions", class: "wide-only", key: (row) => pairs[row].hits, fill: (cell, row) => {
-      const { spans, more } = pairs[row];
-      fillSpans(cell, spans.map(([since, until, hits]) => `${range(since, until)}: ${count(hits)}`), more);
+      const { spans, more_spans } = pairs[row];
+      fillSpans(cell, spans.map(([since, until, hits]) => `${range(since, until)}: ${count(hits)}`), more_spans);
     } },
     { title: "Intersections at rest", class: "wide-only", key: (row) => pairs[row].rest.reduce((most, span) => Math.max(most, span[2]), 0), fill: (cell, row) => {
       const { rest, more_rest } = pairs[row];
@@ -147,9 +156,16 @@ function fillPairs() {
   if (data.has_baseline) columns.splice(2, 0, { title: "New", class: "wide-only", key: (row) => pairs[row].new.length + pairs[row].more_new, fill: (cell, row) => {
     fillSpans(cell, pairs[row].new.map(([what, start, end]) => `${what} ${start === end ? `at ${short(start)}` : `in ${short(start)} to ${short(end)}`}`), pairs[row].more_new);
   } });
-  byId("pairs-count").textContent = pairs.length ? `${plural(pairs.length, "pair")}, the deepest first` : "";
-  byId("pairs-panel").hidden = !pairs.length;
+  byId("pairs-panel").hidden = !pairs.length || Boolean(data.nothing);
   byId("depth-note").hidden = !pairs.some(({ depth }) => depth);
-  pairTable = new LongTable(byId("pairs"), columns, 78, () => {}, { index: 1, way: -1 });
-  pairTable.show(pairs.map((_, index) => index));
+  pairTable = new LongTable(byId("pairs"), columns, 92, () => {}, { index: -1, way: 1 });
+  showPairs();
+}
+
+function showPairs() {
+  const shown = data.pairs.map((_, row) => row).filter((row) => !isMeant(...data.pairs[row].meshes.map((name) => meshNumbers.get(name))));
+  const later = shown.filter((row) => !data.pairs[row].is_initial).length;
+  const first = later && later < shown.length ? `${plural(later, "begins", "begin")} after the first time and ${later === 1 ? "comes" : "come"} first; of each kind ` : "";
+  byId("pairs-count").textContent = shown.length > 1 ? `${plural(shown.length, "pair")}; ${first}the deepest first` : plural(shown.length, "pair");
+  pairTable.show(shown);
 }

@@ -4,6 +4,7 @@
 const SOLID = 0, GHOST = 1, HIDDEN = 2;
 const meshStates = new Uint8Array(data.meshes.length);
 const isHidden = (mesh) => meshStates[mesh] === HIDDEN;
+const meshNumbers = new Map(data.meshes.map(({ name }, mesh) => [name, mesh]));
 const MOST_NAMED = 40; // meshes in an address
 let meshTable = null, pairTable = null, onMeshStates = () => {};
 
@@ -52,7 +53,7 @@ function readMeshStates(parts) {
   setMeshes(numbers("ghost"), GHOST);
 }
 
-// Adds buttons that isolate, ghost or hide some meshes; a second click on ghost or hide shows them again.
+// Adds buttons that isolate, ghost or hide some meshes, and returns their box; a second click on ghost or hide shows them again.
 function addMeshButtons(parent, meshes) {
   const box = add(parent, "span", { class: "states" });
   const one = meshes.length === 1 ? "this mesh" : "these two meshes";
@@ -65,6 +66,7 @@ function addMeshButtons(parent, meshes) {
   button("Isolate", `Show ${one} alone`, areAlone, () => (areAlone ? showAllMeshes() : isolateMeshes(meshes)));
   button("Ghost", `Show ${one} faintly`, areAll(GHOST), () => setMeshes(meshes, areAll(GHOST) ? SOLID : GHOST));
   button("Hide", `Hide ${one} and their contacts`, areAll(HIDDEN), () => setMeshes(meshes, areAll(HIDDEN) ? SOLID : HIDDEN));
+  return box;
 }
 
 // Returns the numbers of all meshes by their names.
@@ -80,9 +82,9 @@ function fillMeshes() {
       addSwatch(name, { fill: css(meshColor(mesh)), "fill-opacity": meshStates[mesh] === GHOST ? 0.35 : 1 });
       addPrim(name, mesh);
     } },
-    { title: "In the view", class: "buttons", key: (mesh) => meshStates[mesh], fill: (cell, mesh) => addMeshButtons(cell, [mesh]) },
+    { title: "In the view", class: "buttons", key: (mesh) => meshStates[mesh], fill: (cell, mesh) => addMeantButton(addMeshButtons(cell, [mesh]), [mesh]) },
   ];
-  meshTable = new LongTable(byId("meshes"), columns, 36, () => {});
+  meshTable = new LongTable(byId("meshes"), columns, isNarrow ? 53 : 36, () => {});
   const filter = () => {
     const words = byId("mesh-filter").value.toLowerCase().split(/\s+/).filter(Boolean);
     meshTable.show(order.filter((mesh) => words.every((word) => data.meshes[mesh].name.toLowerCase().includes(word))));

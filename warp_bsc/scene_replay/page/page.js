@@ -76,6 +76,7 @@ function mostInterval() {
 
 function fillText() {
   fillHead();
+  byId("verdict").hidden = !data.verdict || Boolean(data.nothing);
   byId("nothing").textContent = data.nothing;
   byId("nothing").hidden = !data.nothing;
   byId("nothing").classList.toggle("banner", !data.is_whole);
@@ -133,6 +134,7 @@ async function start() {
   viewer = makeViewer();
   fillMeshes();
   fillPairs();
+  fillMeant();
   listen();
   if (LAST >= 0 && !location.hash) showInterval(mostInterval());
   rows = await loadRows();

@@ -1,9 +1,11 @@
 // A table of any number of rows; the document contains only the visible ones.
 "use strict";
 
+const isNarrow = matchMedia("(max-width: 760px)").matches; // on which buttons are below texts
+
 class LongTable {
   // columns: {title, width, number, fill(cell, row), key(row)}; key returns a number or a text to sort by. Rows are shown
-  // in the order in which they are given, which is that of the column `natural.index`; `natural.way` is -1 if it descends.
+  // in the order in which they are given, which is that of the column `natural.index`, -1 for none; `natural.way` is -1 if it descends.
   constructor(parent, columns, rowHeight, select, natural = { index: 0, way: 1 }) {
     Object.assign(this, { parent, columns, rowHeight, select, natural, rows: [], sorted: natural, selected: -1, drawn: null, given: [], isPrinting: false });
     const table = add(parent, "table");
@@ -53,7 +55,7 @@ class LongTable {
 
   markOrder() {
     this.heads.forEach((head) => head.removeAttribute("aria-sort"));
-    this.heads[this.sorted.index].setAttribute("aria-sort", this.sorted.way > 0 ? "ascending" : "descending");
+    this.heads[this.sorted.index]?.setAttribute("aria-sort", this.sorted.way > 0 ? "ascending" : "descending");
   }
 
   order() {

@@ -66,5 +66,5 @@ function fillImpacts() {
     from: bin / bins, to: (bin + 1) / bins, parts: [hits],
     tip: `${short(bin / bins)} to ${short((bin + 1) / bins)}\n${plural(hits, "collision")}`,
   }));
-  addBars(byId("impacts"), bars, ["bar"], 520, "share of the interval");
+  addBars(byId("impacts"), bars, ["bar"], Math.min(520, byId("impacts").clientWidth || 520), "share of the interval");
 }

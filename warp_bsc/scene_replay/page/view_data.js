@@ -52,9 +52,9 @@ function pick(values, width, rows) {
   return picked;
 }
 
-// Returns the rows of a block whose two meshes are not hidden.
+// Returns the rows of a block whose two meshes are not hidden, and not marked as meant to meet.
 function visibleRows(block) {
   const rows = [];
-  if (block?.first) for (let i = 0; i < block.first.length; i += 1) if (!isHidden(block.first[i]) && !isHidden(block.second[i])) rows.push(i);
+  if (block?.first) for (let i = 0; i < block.first.length; i += 1) if (!isHidden(block.first[i]) && !isHidden(block.second[i]) && !isMeant(block.first[i], block.second[i])) rows.push(i);
   return rows;
 }

@@ -139,7 +139,10 @@ function makeViewer() {
   // The curves in which visible meshes cut each other.
   function cutsOf(block, segments) {
     const rows = [], length = block ? block.from.length / 3 : 0;
-    for (let i = 0; i < length; i += 1) if (!isHidden(block.curve_meshes[2 * i]) && !isHidden(block.curve_meshes[2 * i + 1])) rows.push(i);
+    for (let i = 0; i < length; i += 1) {
+      const [first, second] = block.curve_meshes.subarray(2 * i, 2 * i + 2);
+      if (!isHidden(first) && !isHidden(second) && !isMeant(first, second)) rows.push(i);
+    }
     const values = new Float32Array(6 * rows.length);
     rows.forEach((row, place) => [block.from, block.to].forEach((ends, i) => values.set(ends.subarray(3 * row, 3 * row + 3), 6 * place + 3 * i)));
     return { count: rows.length, ...segments(values, 24, [0, 12, 0, 12]) };

@@ -32,10 +32,10 @@ def find_meshes(
     selection.check_patterns(finder.found)
 
     meshes, invisible, empty, unselected, warnings = [], [], [], Counter(), []
-    if unmatched := selection.unmatched(finder.found):
-        warnings.append(
-            f"ignore: pairs of patterns that match no meshes: {len(unmatched)}, the first is {' '.join(unmatched[0])}"
-        )
+    for name, unmatched in selection.unmatched(finder.found).items():
+        if unmatched:
+            first = " ".join(unmatched[0])
+            warnings.append(f"{name}: entries that match no meshes: {len(unmatched)}, the first is {first}")
     first_instances: dict[tuple, UsdMesh] = {}
     for found in finder.found:
         if not selection.includes(found):

@@ -78,9 +78,20 @@ def open_stage(path: str | os.PathLike, left_out: LeftOut) -> Usd.Stage:
         try:
             stage = Usd.Stage.Open(str(path))
         except RuntimeError as error:
-            raise ValueError(f"{path}: not a readable USD file: {describe_error(error)}") from None
+            reason = _why_no_alembic(resolved) or f"not a readable USD file: {describe_error(error)}"
+            raise ValueError(f"{path}: {reason}") from None
     check_stage(stage, path, left_out)
     return stage
+
+
+def _why_no_alembic(path: str) -> str:
+    """Returns why OpenUSD cannot open an Alembic file, and what to do; empty for other files, and where it can."""
+    if not path.lower().endswith(".abc") or Sdf.FileFormat.FindByExtension("abc"):
+        return ""
+    return (
+        "Alembic, for which this OpenUSD has no plugin, as usd-core has none: convert it where there is one, as in "
+        f"Houdini or Maya, by usdcat {Path(path).name} --out {Path(path).stem}.usdc"
+    )
 
 
 def check_stage(stage: Usd.Stage, path: str | os.PathLike, left_out: LeftOut) -> None:
@@ -90,9 +101,11 @@ def check_stage(stage: Usd.Stage, path: str | os.PathLike, left_out: LeftOut) ->
             if not (0 < layer.timeCodesPerSecond < math.inf):  # OpenUSD would search for samples without end
                 raise ValueError(f"{path}: timeCodesPerSecond of {layer.identifier} is {layer.timeCodesPerSecond:g}")
     for error in stage.GetCompositionErrors():
-        unreadable = UnreadableError(f"{path}: {in_one_line(str(error))}")
+        text = f"{path}: {in_one_line(str(error))}"
         if missing := _MISSING.search(str(error)):
             prim = stage.GetPrimAtPath(missing["prim"]) if missing["prim"] else Usd.Prim()
-            left_out.add_missing(unreadable, prim, missing["asset"].split(":SDF_FORMAT_ARGS:")[0])
+            asset = missing["asset"].split(":SDF_FORMAT_ARGS:")[0]
+            text += (why := _why_no_alembic(asset)) and f" ({why})"
+            left_out.add_missing(UnreadableError(text), prim, asset)
         else:
-            left_out.add(unreadable)
+            left_out.add(UnreadableError(text))
