@@ -122,7 +122,7 @@ def beside(pictures, titles, note="", band=0):
         left = i * (width + gap)
         draw.rectangle((left, 0, left + width - 1, band), fill=_BACKGROUND)
         whole.paste(picture, (left, band))
-        draw.text((left + 0.5 * width, 14), title, fill=_INK, font=font, anchor="ma", stroke_width=0.4)
+        draw.text((left + 0.5 * width, 14), title, fill=_INK, font=font, anchor="ma", align="center", stroke_width=0.4)
     draw.text((whole.width - 12, height - 10), note, fill=_INK, font=ImageFont.load_default(15), anchor="rs")
     return whole
 

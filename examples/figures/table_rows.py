@@ -521,7 +521,7 @@ def replay_sizes(found: Found) -> Rows:
 # The front page -----------------------------------------------------------------------------------------------------
 
 
-def front(gpu: Found, two_cores: Found, bullet: Found, drape: Found) -> Rows:
+def front(gpu: Found, two_cores: Found, twist: Found, drape: Found) -> Rows:
     """What the front page shows."""
     ball, on_gpu = (
         next(scene for scene in found["scenes"] if _scene_name(scene).startswith("cloth-ball"))
@@ -537,11 +537,16 @@ def front(gpu: Found, two_cores: Found, bullet: Found, drape: Found) -> Rows:
         (f"{size}: all, with time and normal", f"{on_gpu['milliseconds']['cuda_graph']:.1f} ms on an {name}"),
         ("the same on two cores", f"{milliseconds(ball['milliseconds']['detect'])} ({peer})"),
     ]
-    names = {"vbd": "VBD", "vbd-self-contact": "with its self-contact", "ccd-vbd": "with `SolverCCD`"}
-    for found, title, what in (
-        (bullet, "a patch of cloth is shot at a sheet: pairs that pass through", "collisions"),
-        (drape, "a cloth drapes over a ball: edges through faces, worst frame", "crossings"),
-    ):
-        counts = {run["simulator"]: np.max(run["measured"][what]) for run in found["runs"] if run["measured"]}
-        rows.append((title, ", ".join(f"{names[name]} {counts[name]:,}" for name in names)))
+    names = {
+        "vbd-self-contact": "VBD with its self-contact",
+        "implicit": "`SolverImplicit`",
+        "ccd-vbd": "`SolverCCD` behind VBD",
+    }
+    for found, title in ((twist, "a cloth is wrung"), (drape, "a cloth drapes over a ball")):
+        took = {run["simulator"]: run["measured"] for run in found["runs"] if run["measured"]}
+        seconds = {key: 1e-3 * took[key]["milliseconds"]["median"] * took[key]["steps"] for key in names}
+        cells = [f"{names[key]} {np.max(took[key]['crossings']):,}, {two(seconds[key])} s" for key in names]
+        device = found["device_name"].removeprefix("NVIDIA ")
+        what = "for a second: edges through faces in the worst frame, and time for all steps"
+        rows.append((f"{title} {what}", f"{'; '.join(cells)}; on an {device}"))
     return rows

@@ -66,7 +66,7 @@ _INVERTING = tuple(f"inverting_steps_{name}" for name in ("scenes", "hanging", "
 
 TABLES = {
     "front": Table(
-        ("detector_gpu", "detector_two_cores", "penetration_bullet", "penetration_drape"),
+        ("detector_gpu", "detector_two_cores", "penetration_twist", "penetration_drape"),
         table_rows.front,
         has_sources=False,
     ),
