@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from .contacts import Contacts, projected
+from .contacts import Contacts
 from .elastic import Springs
-from .motion import contacts_at, move_freely
+from .motion import contacts_at, move_freely, pushed
 from .surface import Surface
 
 _ROUNDS = 60
@@ -61,7 +61,7 @@ def approach(surface: Surface, x: np.ndarray, springs: Springs, max_strain: floa
                 contacts=known,
                 around=None if is_far else springs.around(held, _RINGS),
             )
-            goal = projected(surface.fixed, goal, known, device=surface.device)
+            goal = pushed(surface, goal, known)
         goal = surface.rounded(goal)
         if _are_near(x, goal, surface.edge):
             break

@@ -239,7 +239,7 @@ def _restored(surface: Surface, before: Faults, after: Faults) -> np.ndarray:
         after: What is wrong with the positions.
     """
     mesh = surface.mesh
-    moved = differ(after.x, surface.home)
+    moved = surface.moved(after.x)
     links, faults = [surface.edges[moved[surface.edges].all(axis=1)]], []
     for found in (before, after):
         pairs = found.crossings[~surface.are_fixed(found.crossings)]

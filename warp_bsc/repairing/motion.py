@@ -80,11 +80,12 @@ def move_freely(
             return goal, Contacts.joined(known)
         known.append(contacts)
         if slides and detection < _PROJECTIONS:
-            goal = projected(surface.fixed, goal, Contacts.joined(known), device=surface.device)
+            goal = pushed(surface, goal, Contacts.joined(known))
         else:
             kept = np.ones(len(start))
             np.minimum.at(kept, contacts.vertices.ravel(), np.repeat(_KEPT_TIME * contacts.toi, 4))
             kept[kept < _LEAST_TIME] = 0.0
+            kept = surface.rigid.least(kept)
             goal = start + kept[:, None] * (goal - start)
         if surface.is_late:
             break
@@ -102,8 +103,14 @@ def push_apart(surface: Surface, x: np.ndarray) -> np.ndarray:
             best, fewest, since = x, len(near.keys), 0
         if not len(near.keys):
             break
-        x, _ = move_freely(surface, x, surface.rounded(projected(surface.fixed, x, near, device=surface.device)))
+        x, _ = move_freely(surface, x, surface.rounded(pushed(surface, x, near)))
     return best
+
+
+def pushed(surface: Surface, x: np.ndarray, contacts: Contacts) -> np.ndarray:
+    """Returns positions at which contacts have their gaps, nearly; rigid groups follow their vertices in contact."""
+    moved = projected(surface.fixed, x, contacts, device=surface.device)
+    return surface.carried(moved, differ(moved, x))
 
 
 def near_pairs(surface: Surface, x: np.ndarray) -> np.ndarray:
@@ -115,14 +122,20 @@ def _near_contacts(surface: Surface, x: np.ndarray) -> Contacts:
     """Returns the pairs that are at most the minimum distance apart at positions in units, as contacts."""
     positions = surface.detected(x)
     found = surface.distance_detector.detect(positions, positions)
-    return as_contacts(surface.mesh, found, surface.min_distance * _MORE_DISTANCE)
+    return _between_bodies(surface, as_contacts(surface.mesh, found, surface.min_distance * _MORE_DISTANCE))
+
+
+def _between_bodies(surface: Surface, contacts: Contacts) -> Contacts:
+    """Returns the contacts that are not within one rigid group, whose shape cannot change."""
+    return contacts.rows(~surface.are_of_one(surface.rigid.of, contacts.vertices))
 
 
 def contacts_at(surface: Surface, x: np.ndarray, held: np.ndarray) -> Contacts:
     """Returns the pairs with held vertices that are near at positions in units, as contacts."""
     positions = surface.detected(x)
     found = as_contacts(surface.mesh, surface.reach_detector.detect(positions, positions, vertices=held))
-    return _with_gaps(surface, found.rows(np.asarray(held[found.vertices].any(axis=1))), near_pairs(surface, x))
+    found = _between_bodies(surface, found.rows(np.asarray(held[found.vertices].any(axis=1))))
+    return _with_gaps(surface, found, near_pairs(surface, x))
 
 
 def _contacts(surface: Surface, start: np.ndarray, goal: np.ndarray, near: np.ndarray) -> Contacts:
@@ -141,7 +154,8 @@ def _contacts(surface: Surface, start: np.ndarray, goal: np.ndarray, near: np.nd
         too_near = too_near.rows(~np.isin(too_near.keys, near))
         contacts = Contacts.joined([contacts.rows(~np.isin(contacts.keys, too_near.keys)), too_near])
     moves = differ(start, goal)
-    return _with_gaps(surface, contacts.rows(np.asarray(moves[contacts.vertices].any(axis=1))), near)
+    contacts = _between_bodies(surface, contacts.rows(np.asarray(moves[contacts.vertices].any(axis=1))))
+    return _with_gaps(surface, contacts, near)
 
 
 def _with_gaps(surface: Surface, contacts: Contacts, near: np.ndarray) -> Contacts:
