@@ -114,7 +114,7 @@ def free(
         movable: Vertices that may move, bool, shape [n], beside those near contours and near pairs.
     """
     untangled = untangle(surface, start, crossings)
-    x = push_apart(surface, untangled.x) if surface.min_distance else untangled.x
+    x = push_apart(surface, untangled.x) if surface.keeps_distance else untangled.x
     (pushed,) = np.nonzero(differ(x, untangled.x))
     may_move = untangled.springs.movable | near(surface, pushed, _RINGS)
     if movable is not None:

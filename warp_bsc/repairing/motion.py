@@ -21,7 +21,7 @@ _KEPT_TIME = 0.8
 _LEAST_TIME = 0.05
 """Shares of the way that are less count as 0, so that the search for a motion ends."""
 _PATIENCE = 4
-"""Pushes without fewer near pairs after which the search ends."""
+"""Pushes that come no nearer to the distances after which the search ends."""
 
 
 class Faults:
@@ -94,13 +94,15 @@ def move_freely(
 
 
 def push_apart(surface: Surface, x: np.ndarray) -> np.ndarray:
-    """Returns positions with the fewest pairs nearer than the minimum distance that are reached without a collision."""
-    best, fewest, since = x, None, 0
+    """Returns positions that lack the least of the distances to keep of those that are reached without a collision."""
+    best, least, since = x, np.inf, 0
     while since < _PATIENCE and not surface.is_late:
         near = _near_contacts(surface, x)
+        between = np.einsum("ij,ijk->ik", near.weights, x[near.vertices])
+        lacking = float((near.gap - np.einsum("ij,ij->i", between, near.normals)).sum())
         since += 1
-        if fewest is None or len(near.keys) < fewest:
-            best, fewest, since = x, len(near.keys), 0
+        if lacking < least:
+            best, least, since = x, lacking, 0
         if not len(near.keys):
             break
         x, _ = move_freely(surface, x, surface.rounded(pushed(surface, x, near)))
@@ -115,14 +117,25 @@ def pushed(surface: Surface, x: np.ndarray, contacts: Contacts) -> np.ndarray:
 
 def near_pairs(surface: Surface, x: np.ndarray) -> np.ndarray:
     """Returns a number for each pair that is at most the minimum distance apart at positions in units, int64."""
-    return _near_contacts(surface, x).keys if surface.min_distance else np.zeros(0, dtype=np.int64)
+    return _near_contacts(surface, x).keys if surface.keeps_distance else np.zeros(0, dtype=np.int64)
 
 
 def _near_contacts(surface: Surface, x: np.ndarray) -> Contacts:
     """Returns the pairs that are at most the minimum distance apart at positions in units, as contacts."""
     positions = surface.detected(x)
     found = surface.distance_detector.detect(positions, positions)
-    return _between_bodies(surface, as_contacts(surface.mesh, found, surface.min_distance * _MORE_DISTANCE))
+    contacts = _between_bodies(surface, as_contacts(surface.mesh, found))
+    return replace(contacts, gap=_distances(surface, contacts))
+
+
+def _distances(surface: Surface, contacts: Contacts) -> np.ndarray:
+    """Returns the distance at which the elements of each contact are put, more than the one that they keep, [n]."""
+    distance = np.full(len(contacts.toi), surface.min_distance)
+    if surface.radius is not None:
+        radii = surface.radius[contacts.vertices]
+        is_second = np.arange(4) >= 1 + contacts.are_of_edges[:, None]
+        distance += np.where(is_second, 0.0, radii).max(axis=1) + np.where(is_second, radii, 0.0).max(axis=1)
+    return _MORE_DISTANCE * distance
 
 
 def _between_bodies(surface: Surface, contacts: Contacts) -> Contacts:
@@ -149,7 +162,7 @@ def _contacts(surface: Surface, start: np.ndarray, goal: np.ndarray, near: np.nd
     """
     x0, x1 = surface.detected(start), surface.detected(goal)
     contacts = as_contacts(surface.mesh, surface.detector.detect(x0, x1))
-    if surface.min_distance:
+    if surface.keeps_distance:
         too_near = as_contacts(surface.mesh, surface.distance_detector.detect(x0, x1))
         too_near = too_near.rows(~np.isin(too_near.keys, near))
         contacts = Contacts.joined([contacts.rows(~np.isin(contacts.keys, too_near.keys)), too_near])
@@ -162,6 +175,6 @@ def _with_gaps(surface: Surface, contacts: Contacts, near: np.ndarray) -> Contac
     """Returns contacts with the distances that they are to have: the minimum distance, unless they are near ones."""
     # short edges would be strained by the gap of longer ones
     gap = _GAP * surface.shortest[contacts.vertices].min(axis=1)
-    if surface.min_distance:
-        gap = np.where(np.isin(contacts.keys, near), gap, _MORE_DISTANCE * surface.min_distance)
+    if surface.keeps_distance:
+        gap = np.where(np.isin(contacts.keys, near), gap, _distances(surface, contacts))
     return replace(contacts, gap=gap)

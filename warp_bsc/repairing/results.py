@@ -40,12 +40,12 @@ class RepairResult:
     Attributes:
         x: Positions, as given: float32 or float64, NumPy or Warp. What has not moved has the bits of the input.
         certified: Whether no edge meets a face at these positions, decided exactly in their type, and each pair with a
-            moved vertex keeps the minimum distance, or the distance of the input if that was less. Elements that share
-            a vertex, or a doubled one, are excluded: they may touch.
+            moved vertex keeps the minimum distance and its radii, or the distance of the input if that was less.
+            Elements that share a vertex, or a doubled one, are excluded: they may touch.
         crossings_before: Number of edges that meet a face in the input, each counted once a face.
         crossings: Number of those in ``x``, never more.
-        near_before: Number of pairs of elements that are at most the minimum distance apart in the input, 0 without
-            one. Neighbours do not count, see :class:`warp_bsc.CollisionDetector`.
+        near_before: Number of pairs of elements that are at most the minimum distance and their radii apart in the
+            input, 0 without them. Neighbours do not count, see :class:`warp_bsc.CollisionDetector`.
         near: Number of those in ``x``.
         moved: Distance of each vertex from its input, in the unit of the positions, float64, shape [vertex_count].
         max_strain: Largest change of the length of an edge, as a share of its length in the input.

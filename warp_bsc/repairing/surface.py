@@ -64,9 +64,15 @@ def _pairs_within(places: np.ndarray, labels: list[np.ndarray], tolerance: float
     return pairs[near]
 
 
-def welded(mesh: CollisionMesh, weld: np.ndarray) -> CollisionMesh:
-    """Returns the mesh whose faces and edges use no vertex that is welded to another one, with the same numbers."""
-    if mesh.radius is None and not mesh.only_free and (weld == np.arange(len(weld))).all():
+def welded(mesh: CollisionMesh, weld: np.ndarray, radius: np.ndarray | None = None) -> CollisionMesh:
+    """Returns the mesh whose faces and edges use no vertex that is welded to another one, with the same numbers.
+
+    Args:
+        mesh: The mesh.
+        weld: The vertex that each vertex is welded to, int, shape [n].
+        radius: Radius of each vertex in place of those of the mesh; default: none.
+    """
+    if mesh.radius is radius and not mesh.only_free and (weld == np.arange(len(weld))).all():
         return mesh
     edges = weld[mesh.edges[mesh.free_edges]]
     return CollisionMesh(
@@ -74,6 +80,7 @@ def welded(mesh: CollisionMesh, weld: np.ndarray) -> CollisionMesh:
         mesh.vertex_count,
         edges=edges[edges[:, 0] != edges[:, 1]],
         points=weld[mesh.points],
+        radius=radius,
         world=mesh.world,
         group=mesh.group,
         mask=mesh.mask,
@@ -110,7 +117,8 @@ class Surface:
         lengths: Length of each of the edges in the input, in units, float64, shape [m].
         edge: Median length of the edges, but for links.
         shortest: Length of the shortest edge of each vertex, at most the median, in units, float64, shape [n].
-        min_distance: Distance that elements keep, in units, 0 for none.
+        min_distance: Distance that elements keep beside their radii, in units, 0 for none.
+        radius: Radius of each vertex, in units, float64, shape [n]; None if all are 0.
         end: Time at which a search ends with what it has found, as of ``time.monotonic`` [s].
     """
 
@@ -165,6 +173,10 @@ class Surface:
         self._ends = np.clip(np.where(self._offset == 0.0, [[-most], [most]], ends), -most, most)
         self.home = self.in_units(x)
         self.min_distance = min_distance / self.unit
+        self.radius = None
+        if self.given.radius is not None:
+            self.radius = np.zeros(len(x))
+            np.maximum.at(self.radius, weld, self.given.radius / self.unit)
         self.lengths = self._lengths_of(self.home, slice(None))
         lengths, ends = self.lengths[:count], self.ends[:, :count]
         self.edge = float(np.median(lengths)) if count else 1.0
@@ -180,13 +192,23 @@ class Surface:
 
     @functools.cached_property
     def distance_detector(self) -> CollisionDetector:
-        """A detector of pairs that come within the minimum distance."""
-        return CollisionDetector(self.mesh, min_distance=self.min_distance)
+        """A detector of pairs that come within the distance that they keep."""
+        return CollisionDetector(self._thick_mesh, min_distance=self.min_distance)
 
     @functools.cached_property
     def reach_detector(self) -> CollisionDetector:
         """A detector of pairs that a motion may bring together."""
-        return CollisionDetector(self.mesh, min_distance=max(_REACH * self.edge, 1.01 * self.min_distance))
+        return CollisionDetector(self._thick_mesh, min_distance=max(_REACH * self.edge, 1.01 * self.min_distance))
+
+    @functools.cached_property
+    def _thick_mesh(self) -> CollisionMesh:
+        """The mesh with its radii."""
+        return welded(self.mesh, self.weld, self.radius)
+
+    @property
+    def keeps_distance(self) -> bool:
+        """Whether elements keep a distance."""
+        return self.min_distance > 0.0 or self.radius is not None
 
     @property
     def is_late(self) -> bool:
