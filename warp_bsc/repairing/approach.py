@@ -28,9 +28,7 @@ _SOUGHT = 0.5
 """Strain that springs leave, as a share of the limit."""
 
 
-def approach(
-    surface: Surface, x: np.ndarray, springs: Springs, max_strain: float, rounds: int = _ROUNDS
-) -> np.ndarray:
+def approach(surface: Surface, x: np.ndarray, springs: Springs, max_strain: float, rounds: int = _ROUNDS) -> np.ndarray:
     """Returns positions near the input that can be reached from a start without a collision.
 
     What is free to go returns to its input. What contact keeps from it takes its neighbours along until strains are
