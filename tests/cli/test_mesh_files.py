@@ -109,6 +109,22 @@ def test_files_that_are_kept_are_obstacles(folder, capsys):
     assert (folder / "first.obj").read_bytes() == before
 
 
+def test_each_piece_of_a_rigid_file_moves_as_a_whole(folder, capsys):
+    """Two balls as one file, with a third one between them."""
+    trimesh.creation.icosphere(2).apply_translation([1.05, 1.6, 0.1]).export("third.obj")
+    apart = trimesh.util.concatenate([FIRST, SECOND.copy().apply_translation([0.2, 0.0, 0.0])])
+    apart.export("parts.obj")
+    facts = facts_of(capsys, "third.obj", "parts.obj", "--rigid", "parts*", "--keep", "third.obj", "--output", "o.obj")
+    assert facts["before"]["intersections"] > 0 and facts["certified"]
+    moves = MeshFile("o.obj").x - MeshFile("parts.obj").x
+    count = len(FIRST.vertices)
+    for piece in (slice(count), slice(count, None)):
+        before, after = (mesh.x[piece] for mesh in (MeshFile("parts.obj"), MeshFile("o.obj")))
+        lengths = [np.linalg.norm(x[:, None] - x[None], axis=2) for x in (before, after)]
+        assert moves[piece].any() and np.abs(lengths[0] - lengths[1]).max() < 1e-13
+    assert np.abs(moves[:count].mean(axis=0) - moves[count:].mean(axis=0)).max() > 0.01
+
+
 def test_what_crosses_among_obstacles_does_not_count(folder, capsys):
     """A ball that crosses another one, both of them obstacles, under a third."""
     SECOND.apply_translation([0.0, 1.8, 0.0]).export("third.obj")
@@ -225,6 +241,8 @@ def test_seams_stay_closed(folder, capsys):
         (["balls.obj", "--output", "free.obj", "--frames", "1:2"], "--frames is not for mesh files"),
         (["balls.obj", "--output", "free.obj", "--fail-on", "distorted"], "--fail-on distorted is for shots"),
         (["demo", "--output", "free.usda", "--order"], "--order is not for USD scenes"),
+        (["demo", "--output", "free.usda", "--rigid", "*"], "--rigid is not for USD scenes"),
+        (["balls.obj", "--output", "free.obj", "--rigid", "x*"], "--rigid: no file matches x*"),
         (["demo", "--output", "free.usda", "--max-strain", "0.5"], "--max-strain is not for USD scenes"),
         (["balls.obj", "--output", "free.obj", "--previous", "first.obj"], "--previous: the files must have the faces"),
         (["balls.obj", "--output", "free.obj", "--previous", "balls.off"], "--previous must not cross"),

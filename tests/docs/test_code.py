@@ -146,7 +146,7 @@ def test_repair(tmp_path, capsys):
     assert (names["result"].crossings_before, names["result"].crossings, names["result"].certified) == (60, 0, True)
     lines = output.split("\n")
     moved, strain = map(float, lines[1].split())
-    assert lines[0] == "72 0 True" and lines[2] == "42 0 60 0"
+    assert lines[0] == "72 0 True" and lines[2:4] == ["True 0 True", "42 0 60 0"]
     assert round(moved, 2) == 0.03 and round(strain, 3) == 0.014
 
 
@@ -162,6 +162,8 @@ def test_commands_of_mesh_files(tmp_path, capsys, monkeypatch):
         ("garment.obj", 1.02, dent),
         ("shirt.ply", 1.02, dent),
         ("coat.stl", 1.04, dent),
+        ("coat.obj", 1.02, dent),
+        ("buttons.obj", 0.05, np.array([0.0, 0.0, 1.03])),
         ("hero.glb", 1.0, 0.0),
         *((f"body_{number}.obj", 1.0, 0.0) for number in (1, 2)),
         *((f"coat_{number}.obj", 1.02, number * dent) for number in (1, 2)),
@@ -170,13 +172,13 @@ def test_commands_of_mesh_files(tmp_path, capsys, monkeypatch):
         trimesh.Trimesh(radius * ball.vertices + moves, ball.faces).export(name)
     section = (DOCS / "usd" / "repair.md").read_text().partition("## Positions")[0]
     commands, frames, checks = (block.splitlines() for block in re.findall(r"```sh\n(.*?)```", section, re.DOTALL))
-    assert len(commands) == len(checks) == 5 and len(frames) == 2
+    assert (len(commands), len(frames), len(checks)) == (6, 2, 5)
     for number, command in enumerate(commands):
         assert main([*shlex.split(command)[1:], "--device", "cpu"]) == 0
         said = capsys.readouterr().out
         assert " 0 remain." in said and "read again: certified." in said
         assert ("Intersections: 0 before" in said) == (number in (0, 3, 4))  # the garment alone, and the hero
-    assert sorted(path.name for path in tmp_path.glob("free/*")) == ["coat.stl", "shirt.ply"]
+    assert sorted(path.name for path in tmp_path.glob("free/*")) == ["buttons.obj", "coat.obj", "coat.stl", "shirt.ply"]
     for command in frames:
         assert main([*shlex.split(command)[1:], "--device", "cpu"]) == 0
         said = capsys.readouterr().out

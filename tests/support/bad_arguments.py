@@ -396,6 +396,8 @@ def calls() -> dict[str, Call]:
             "mesh": without(OBJECTS, "None") | {"negative": -FACES, "columns": np.zeros((2, 4), int)},
             "x": COORDINATES,
             "fixed": vertices,
+            "rigid": without(bad_arrays(np.zeros(6, int), index=True), "None", "negative")
+            | {"negative": np.full(6, -2), "shared": [[0, 1], [1, 2]], "out of range": [[0], [9]]},
             "order": without(bad_arrays(np.zeros(6, int), index=True), "None", "negative")
             | {"negative": np.full(6, -2), "shared": [[0, 1], [1, 2]], "out of range": [[0], [9]]},
             "x_previous": without(COORDINATES, "None") | {"single": X.astype(np.float32)},
@@ -868,6 +870,7 @@ TEXTS = {
     "--exclude",
     "--keep",
     "--previous",
+    "--rigid",
     "--output",
     "--figure",
     "--between",

@@ -75,7 +75,7 @@ examples:
 {explain_statuses(ExitStatus.FOUND, ExitStatus.LEFT_OUT, ExitStatus.EMPTY)}"""
 
 _OF_ALL = {"command_line", "scene", "output", "report", "keep", "min_distance", "json", "fail_on", "device"}
-_OF_ONE_FRAME = {"max_strain", "order", "previous"}
+_OF_ONE_FRAME = {"max_strain", "order", "previous", "rigid"}
 _OF_FRAMES = {"max_move", "resume"}
 """The options for everything, for mesh files of one frame alone, and for several frames. Others are for USD alone."""
 
@@ -115,6 +115,7 @@ def add_to(commands: Commands, summary: str) -> None:
     add_options(files, {"--max-strain": number(positive_real, "strain to keep to (default: %(default)s)", default=0.1)})
     add_options(files, {"--order": flag("the files are sheets, from inside to outside, whose faces point outside")})
     add_options(files, {"--previous": patterns(previous) | {"metavar": "FILE"}})
+    add_options(files, {"--rigid": patterns("hard parts: files whose connected pieces each move as a whole")})
     command.set_defaults(default_of=command.get_default)
     out = command.add_argument_group("output")
     add_options(

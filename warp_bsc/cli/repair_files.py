@@ -16,6 +16,7 @@ from ..mesh_files.check import find_meeting
 from ..mesh_files.file_scene import FileScene
 from ..mesh_files.frames import Frames, make_folder
 from ..mesh_files.mesh_file import MeshFile, MeshScene, is_mesh_file
+from ..repairing.contours import connected_components
 from ..repairing.repair import repair
 from ..repairing.results import RepairResult
 from ..repairing.shot.findings import kept_meshes
@@ -57,7 +58,9 @@ def repair_files(frames: Frames, arguments: argparse.Namespace) -> int:
     if previous and not np.array_equal(previous.faces, scene.faces):
         raise ValueError("--previous: the files must have the faces of the scene")
     kept = np.array([output is None for output in outputs])
+    are_rigid = np.array(frames.matching(arguments.rigid, "--rigid"))
     mesh = _mesh_of(scene, kept, device)
+    pieces = connected_components(len(scene.x), mesh.edges)
     make_folder(arguments.output)
     with contextlib.ExitStack() as stack:
         files, page = [], None
@@ -72,6 +75,7 @@ def repair_files(frames: Frames, arguments: argparse.Namespace) -> int:
                 mesh,
                 scene.x,
                 fixed=kept[scene.file_of],
+                rigid=np.where(are_rigid[scene.file_of], pieces, -1),
                 order=scene.file_of if arguments.order else None,
                 x_previous=previous.x if previous else None,
                 min_distance=arguments.min_distance,

@@ -29,6 +29,20 @@ class Frames(NamedTuple):
         """Whether each name stands for another file at each frame."""
         return [len(self.numbers) > 1 and len(set(paths)) > 1 for paths in zip(*self.paths, strict=True)]
 
+    def matching(self, patterns: Iterable[str], option: str) -> list[bool]:
+        """Returns whether each name matches one of some patterns.
+
+        Raises:
+            ValueError: If a pattern matches no name; ``option`` is where it was given.
+        """
+        found = [False] * len(self.names)
+        for pattern in patterns:
+            matching = [name == pattern or fnmatch.fnmatchcase(name, pattern) for name in self.names]
+            if not any(matching):
+                raise ValueError(f"{option}: no file matches {pattern}")
+            found = [a or b for a, b in zip(found, matching, strict=True)]
+        return found
+
     def outputs(self, keep: Iterable[str], output: str, read: Iterable[str] = ()) -> list[list[str | None]]:
         """Returns where each file is written to, None for those that are not.
 
@@ -43,11 +57,7 @@ class Frames(NamedTuple):
                 in another format.
         """
         kept = [len(self.numbers) > 1 and not several for several in self.are_several]
-        for pattern in keep:
-            matching = [name == pattern or fnmatch.fnmatchcase(name, pattern) for name in self.names]
-            if not any(matching):
-                raise ValueError(f"--keep: no file matches {pattern}")
-            kept = [a or b for a, b in zip(kept, matching, strict=True)]
+        kept = [a or b for a, b in zip(kept, self.matching(keep, "--keep"), strict=True)]
         into = _is_folder(output) or os.path.isdir(output)
         if kept.count(False) != 1 and not into:
             raise ValueError(f"{output}: must be a folder, as not one file may move; --keep names obstacles")

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from .contacts import Contacts, projected
+from .contacts import Contacts
 from .elastic import Springs
-from .motion import contacts_at, move_freely
+from .motion import contacts_at, move_freely, pushed
 from .surface import Surface
 
 _ROUNDS = 60
@@ -28,7 +28,7 @@ _SOUGHT = 0.5
 """Strain that springs leave, as a share of the limit."""
 
 
-def approach(surface: Surface, x: np.ndarray, springs: Springs, max_strain: float) -> np.ndarray:
+def approach(surface: Surface, x: np.ndarray, springs: Springs, max_strain: float, rounds: int = _ROUNDS) -> np.ndarray:
     """Returns positions near the input that can be reached from a start without a collision.
 
     What is free to go returns to its input. What contact keeps from it takes its neighbours along until strains are
@@ -40,17 +40,19 @@ def approach(surface: Surface, x: np.ndarray, springs: Springs, max_strain: floa
         x: The start, in units of the surface, shape [n, 3]. What crosses there may cross in the end, nothing else.
         springs: Springs of the vertices that may move.
         max_strain: Largest strain.
+        rounds: Motions after which it ends.
     """
     best, score = x, score_of(surface, x, max_strain)
     best_score = score
     held, stalled, contacts, nearest = np.zeros(len(x), dtype=bool), 0, Contacts.none(), np.inf
-    for _ in range(_ROUNDS):
+    for _ in range(rounds):
         goal = np.where(held[:, None], x, surface.home)
         farthest = np.abs(goal - x).max(initial=0.0)
         is_far = farthest > _LEAP * surface.edge
         if is_far:
             goal = x + _LEAP * surface.edge / farthest * (goal - x)
-        if is_far or held.any():
+        is_relaxed = is_far or bool(held.any())
+        if is_relaxed:
             # planes of earlier positions would keep pairs from places that are free
             known = Contacts.joined([contacts, contacts_at(surface, x, held)]).latest()
             goal = springs.relax(
@@ -61,11 +63,15 @@ def approach(surface: Surface, x: np.ndarray, springs: Springs, max_strain: floa
                 contacts=known,
                 around=None if is_far else springs.around(held, _RINGS),
             )
-            goal = projected(surface.fixed, goal, known, device=surface.device)
+            goal = pushed(surface, goal, known)
         goal = surface.rounded(goal)
         if _are_near(x, goal, surface.edge):
             break
         start, (x, contacts) = x, move_freely(surface, x, goal)
+        if is_relaxed and not is_far and not _are_near(x, goal, surface.edge):
+            # what one contact has stopped early is strained, and goes on beside the others
+            x, more = move_freely(surface, x, goal)
+            contacts = Contacts.joined([contacts, more])
         held[contacts.vertices] = True
         score = score_of(surface, x, max_strain)
         is_nearer = is_far and farthest < _PROGRESS * nearest

@@ -1,4 +1,4 @@
-"""Checks the arguments of a repair and converts them: the mesh, vertices that stay, and the sheet of each vertex."""
+"""Checks the arguments of a repair and converts them: the mesh, vertices that stay, and the set of each vertex."""
 
 import sys
 from collections.abc import Sequence
@@ -61,37 +61,38 @@ def checked_mask(vertices: Any, name: str, count: int) -> np.ndarray:
     return mask
 
 
-def checked_sheets(order: Any, count: int) -> np.ndarray:
-    """Returns the sheet of each vertex from inside to outside, -1 for none, int, shape [count].
+def checked_sets(sets: Any, name: str, count: int) -> np.ndarray:
+    """Returns the set that each vertex is in, such as its sheet, -1 for none, int, shape [count].
 
     Args:
-        order: A sheet for each vertex, integers of at least -1, as an array; or a sequence of sets of vertices.
+        sets: A number for each vertex, integers of at least -1, as an array; or a sequence of sets of vertices.
+        name: Name of the argument in errors.
         count: Number of vertices.
 
     Raises:
         TypeError: If it is neither.
-        ValueError: If sheets or sets have another shape or are out of range, or sets share a vertex.
+        ValueError: If numbers or sets have another shape or are out of range, or sets share a vertex.
     """
-    if isinstance(order, np.ndarray | wp.array):
-        values = as_numpy(order, "order")
+    if isinstance(sets, np.ndarray | wp.array):
+        values = as_numpy(sets, name)
         if values.shape != (count,) or not np.issubdtype(values.dtype, np.integer):
             raise ValueError(
-                f"order as an array must be {count} integers, one a vertex, not {values.dtype} {values.shape}"
+                f"{name} as an array must be {count} integers, one a vertex, not {values.dtype} {values.shape}"
             )
         if values.min(initial=0) < -1 or values.max(initial=0) >= 2**31:
-            raise ValueError(f"order must be in [-1, 2^31), not {values.min(initial=0)} to {values.max(initial=0)}")
+            raise ValueError(f"{name} must be in [-1, 2^31), not {values.min(initial=0)} to {values.max(initial=0)}")
         return values.astype(np.int64)
-    if isinstance(order, str) or not isinstance(order, Sequence):
-        raise TypeError(f"order must be an array of sheets or a sequence of sets of vertices, not {given(order)}")
-    sheet = np.full(count, -1)
-    for number, vertices in enumerate(order):
-        mask = checked_mask(vertices, f"order[{number}]", count)
-        shared = mask & (sheet >= 0)
+    if isinstance(sets, str) or not isinstance(sets, Sequence):
+        raise TypeError(f"{name} must be an array of numbers or a sequence of sets of vertices, not {given(sets)}")
+    number_of = np.full(count, -1)
+    for number, vertices in enumerate(sets):
+        mask = checked_mask(vertices, f"{name}[{number}]", count)
+        shared = mask & (number_of >= 0)
         if shared.any():
             vertex = np.argmax(shared)
-            raise ValueError(f"order[{number}] has vertex {vertex}, which order[{sheet[vertex]}] has as well")
-        sheet[mask] = number
-    return sheet
+            raise ValueError(f"{name}[{number}] has vertex {vertex}, which {name}[{number_of[vertex]}] has as well")
+        number_of[mask] = number
+    return number_of
 
 
 def checked_seams(mesh: CollisionMesh, x: np.ndarray, weld: np.ndarray, fixed: np.ndarray) -> np.ndarray:

@@ -19,6 +19,11 @@ _OFFSET = 0.1
 """Distance by which layers that lie on each other leave each other, in edges."""
 _FAR = 4.0
 """Move, in edges, above which another order of pieces is tried, which may be nearer."""
+_ROUNDS_CROSSING, _ROUNDS_OF_ORDER = 8, 2
+"""Motions of returns that are hardly the result: of what still crosses, and of what tells which order is the nearer."""
+_FARTHER = 2.0
+"""Squared moves at the start of an order, as a multiple of those that free the other one, above which it is not tried.
+"""
 _FLATTEST = 0.01
 """Length of the sum of normals around a vertex, as a share of that of their lengths, below which it has no normal."""
 _SWEEPS, _DOUBLINGS = 8, 10
@@ -93,7 +98,10 @@ def _found(
             chosen[:] = -1
         else:
             x = ordered
-    return x
+    if surface.are_fixed(surface.crossings(x)).all():
+        return x
+    springs = Springs(surface, near(surface, surface.moved(x), _RINGS))
+    return _returned(surface, x, springs, max_strain)
 
 
 def free(
@@ -113,15 +121,38 @@ def free(
         max_strain: Largest strain that is sought.
         movable: Vertices that may move, bool, shape [n], beside those near contours and near pairs.
     """
+    x, springs = _opened(surface, start, crossings, movable)
+    left = _pieces_that_cross(surface, x, connected_components(len(x), surface.edges))
+    if not len(left):
+        return _returned(surface, x, springs, max_strain)
+    is_of_two = (left[:, 0] != left[:, 1]).all()  # pieces that an order may free
+    return _returned(surface, x, springs, max_strain, rounds=_ROUNDS_OF_ORDER if is_of_two else _ROUNDS_CROSSING)
+
+
+def _pieces_that_cross(surface: Surface, x: np.ndarray, piece: np.ndarray) -> np.ndarray:
+    """Returns the pieces of edges and faces that cross and are not fixed, given that of each vertex, shape [m, 2]."""
+    left = surface.crossings(x)
+    left = left[~surface.are_fixed(left)]
+    return np.stack([piece[surface.mesh.edges[left[:, 0], 0]], piece[surface.mesh.faces[left[:, 1], 0]]], axis=1)
+
+
+def _opened(
+    surface: Surface, start: np.ndarray, crossings: np.ndarray, movable: np.ndarray | None
+) -> tuple[np.ndarray, Springs]:
+    """Returns positions at which less crosses, or is near, and springs of what may move; as :func:`free` otherwise."""
     untangled = untangle(surface, start, crossings)
-    x = push_apart(surface, untangled.x) if surface.min_distance else untangled.x
+    x = push_apart(surface, untangled.x) if surface.keeps_distance else untangled.x
     (pushed,) = np.nonzero(differ(x, untangled.x))
     may_move = untangled.springs.movable | near(surface, pushed, _RINGS)
     if movable is not None:
         may_move |= movable
     is_known = (may_move == untangled.springs.movable).all()
-    x = approach(surface, x, untangled.springs if is_known else Springs(surface, may_move), max_strain)
-    return follow_surface(surface, x)
+    return x, untangled.springs if is_known else Springs(surface, may_move)
+
+
+def _returned(surface: Surface, x: np.ndarray, springs: Springs, max_strain: float, **options) -> np.ndarray:
+    """Returns positions as :func:`.approach`, whose arguments it has, with the inside of tetrahedra."""
+    return follow_surface(surface, approach(surface, x, springs, max_strain, **options))
 
 
 def offset(surface: Surface, crossings: np.ndarray) -> np.ndarray:
@@ -165,9 +196,8 @@ def free_by_smoothing(surface: Surface, start: np.ndarray, max_strain: float) ->
         max_strain: Largest strain that is sought.
     """
     edges, piece = surface.edges, connected_components(len(start), surface.edges)
-    crossings = surface.crossings(start)
-    first, second = (piece[of[crossings[:, k], 0]] for k, of in enumerate((surface.mesh.edges, surface.mesh.faces)))
-    crossing = first[(first == second) & ~surface.are_fixed(crossings)]
+    first, second = _pieces_that_cross(surface, start, piece).T
+    crossing = first[first == second]
     if not len(crossing):
         return start
     springs, x = Springs(surface, np.isin(piece, crossing) & ~surface.fixed), start
@@ -186,7 +216,7 @@ def free_by_smoothing(surface: Surface, start: np.ndarray, max_strain: float) ->
         placed = means(start, piece)[piece] + scale * (x - means(x, piece)[piece])
         opened = surface.rounded(np.where(is_whole[:, None], placed, x))
         if surface.are_fixed(surface.crossings(opened)).all():
-            return follow_surface(surface, approach(surface, opened, springs, max_strain))
+            return _returned(surface, opened, springs, max_strain)
         if surface.is_late:
             break
     return start
@@ -208,22 +238,25 @@ def free_by_order(
     """
     piece, tried = connected_components(len(x), surface.edges), set()
     while True:
-        left = surface.crossings(x)
-        ends = np.stack([piece[surface.mesh.edges[left[:, 0], 0]], piece[surface.mesh.faces[left[:, 1], 0]]], axis=1)
-        of_two = (ends[:, 0] != ends[:, 1]) & ~surface.are_fixed(left)
-        pairs = sorted(set(map(tuple, np.sort(ends[of_two], axis=1).tolist())) - tried)
+        ends = _pieces_that_cross(surface, x, piece)
+        pairs = sorted(set(map(tuple, np.sort(ends[ends[:, 0] != ends[:, 1]], axis=1).tolist())) - tried)
         if not pairs or surface.is_late:
             return x
         tried.add(pairs[0])
-        found = []
+        starts, found = [], []
         for inner, outer in (pairs[0], pairs[0][::-1]):
             sheet = np.where(piece == inner, 0, np.where(piece == outer, 1, -1))
             y = separate_sheets(surface, sheet, np.where(sheet[:, None] < 0, x, surface.home))
-            y = free(surface, y, surface.crossings(y), max_strain, movable=~surface.fixed)
-            found.append((rank(y), inner, outer, y))
-        best, inner, outer, y = min(found, key=lambda each: (each[0][:2], each[0][-1]))
+            starts.append((float((surface.moves(y) ** 2).sum()), inner, outer, y))
+        for moves, inner, outer, start in sorted(starts, key=lambda each: each[0]):
+            if found and not any(found[0][0][:2]) and moves > _FARTHER * found[0][0][-1]:
+                break
+            y, springs = _opened(surface, start, surface.crossings(start), ~surface.fixed)
+            nearly = _returned(surface, y, springs, max_strain, rounds=_ROUNDS_OF_ORDER)
+            found.append((rank(nearly), inner, outer, y, springs))
+        best, inner, outer, y, springs = min(found, key=lambda each: (each[0][:2], each[0][-1]))
         if best[:2] < rank(x)[:2]:
-            x = y
+            x = _returned(surface, y, springs, max_strain)
             chosen[(piece == inner) & (chosen < 0)] = 0
             chosen[piece == outer] = np.maximum(chosen[piece == outer], chosen[piece == inner].max() + 1)
 
@@ -239,7 +272,7 @@ def _restored(surface: Surface, before: Faults, after: Faults) -> np.ndarray:
         after: What is wrong with the positions.
     """
     mesh = surface.mesh
-    moved = differ(after.x, surface.home)
+    moved = surface.moved(after.x)
     links, faults = [surface.edges[moved[surface.edges].all(axis=1)]], []
     for found in (before, after):
         pairs = found.crossings[~surface.are_fixed(found.crossings)]

@@ -21,7 +21,7 @@ _KEPT_TIME = 0.8
 _LEAST_TIME = 0.05
 """Shares of the way that are less count as 0, so that the search for a motion ends."""
 _PATIENCE = 4
-"""Pushes without fewer near pairs after which the search ends."""
+"""Pushes that come no nearer to the distances after which the search ends."""
 
 
 class Faults:
@@ -80,11 +80,12 @@ def move_freely(
             return goal, Contacts.joined(known)
         known.append(contacts)
         if slides and detection < _PROJECTIONS:
-            goal = projected(surface.fixed, goal, Contacts.joined(known), device=surface.device)
+            goal = pushed(surface, goal, Contacts.joined(known))
         else:
             kept = np.ones(len(start))
             np.minimum.at(kept, contacts.vertices.ravel(), np.repeat(_KEPT_TIME * contacts.toi, 4))
             kept[kept < _LEAST_TIME] = 0.0
+            kept = surface.rigid.least(kept)
             goal = start + kept[:, None] * (goal - start)
         if surface.is_late:
             break
@@ -93,36 +94,61 @@ def move_freely(
 
 
 def push_apart(surface: Surface, x: np.ndarray) -> np.ndarray:
-    """Returns positions with the fewest pairs nearer than the minimum distance that are reached without a collision."""
-    best, fewest, since = x, None, 0
+    """Returns positions that lack the least of the distances to keep of those that are reached without a collision."""
+    best, least, since = x, np.inf, 0
     while since < _PATIENCE and not surface.is_late:
         near = _near_contacts(surface, x)
+        between = np.einsum("ij,ijk->ik", near.weights, x[near.vertices])
+        lacking = float((near.gap - np.einsum("ij,ij->i", between, near.normals)).sum())
         since += 1
-        if fewest is None or len(near.keys) < fewest:
-            best, fewest, since = x, len(near.keys), 0
+        if lacking < least:
+            best, least, since = x, lacking, 0
         if not len(near.keys):
             break
-        x, _ = move_freely(surface, x, surface.rounded(projected(surface.fixed, x, near, device=surface.device)))
+        x, _ = move_freely(surface, x, surface.rounded(pushed(surface, x, near)))
     return best
+
+
+def pushed(surface: Surface, x: np.ndarray, contacts: Contacts) -> np.ndarray:
+    """Returns positions at which contacts have their gaps, nearly; rigid groups follow their vertices in contact."""
+    moved = projected(surface.fixed, x, contacts, device=surface.device)
+    return surface.carried(moved, differ(moved, x))
 
 
 def near_pairs(surface: Surface, x: np.ndarray) -> np.ndarray:
     """Returns a number for each pair that is at most the minimum distance apart at positions in units, int64."""
-    return _near_contacts(surface, x).keys if surface.min_distance else np.zeros(0, dtype=np.int64)
+    return _near_contacts(surface, x).keys if surface.keeps_distance else np.zeros(0, dtype=np.int64)
 
 
 def _near_contacts(surface: Surface, x: np.ndarray) -> Contacts:
     """Returns the pairs that are at most the minimum distance apart at positions in units, as contacts."""
     positions = surface.detected(x)
     found = surface.distance_detector.detect(positions, positions)
-    return as_contacts(surface.mesh, found, surface.min_distance * _MORE_DISTANCE)
+    contacts = _between_bodies(surface, as_contacts(surface.mesh, found))
+    return replace(contacts, gap=_distances(surface, contacts))
+
+
+def _distances(surface: Surface, contacts: Contacts) -> np.ndarray:
+    """Returns the distance at which the elements of each contact are put, more than the one that they keep, [n]."""
+    distance = np.full(len(contacts.toi), surface.min_distance)
+    if surface.radius is not None:
+        radii = surface.radius[contacts.vertices]
+        is_second = np.arange(4) >= 1 + contacts.are_of_edges[:, None]
+        distance += np.where(is_second, 0.0, radii).max(axis=1) + np.where(is_second, radii, 0.0).max(axis=1)
+    return _MORE_DISTANCE * distance
+
+
+def _between_bodies(surface: Surface, contacts: Contacts) -> Contacts:
+    """Returns the contacts that are not within one rigid group, whose shape cannot change."""
+    return contacts.rows(~surface.are_of_one(surface.rigid.of, contacts.vertices))
 
 
 def contacts_at(surface: Surface, x: np.ndarray, held: np.ndarray) -> Contacts:
     """Returns the pairs with held vertices that are near at positions in units, as contacts."""
     positions = surface.detected(x)
     found = as_contacts(surface.mesh, surface.reach_detector.detect(positions, positions, vertices=held))
-    return _with_gaps(surface, found.rows(np.asarray(held[found.vertices].any(axis=1))), near_pairs(surface, x))
+    found = _between_bodies(surface, found.rows(np.asarray(held[found.vertices].any(axis=1))))
+    return _with_gaps(surface, found, near_pairs(surface, x))
 
 
 def _contacts(surface: Surface, start: np.ndarray, goal: np.ndarray, near: np.ndarray) -> Contacts:
@@ -136,18 +162,19 @@ def _contacts(surface: Surface, start: np.ndarray, goal: np.ndarray, near: np.nd
     """
     x0, x1 = surface.detected(start), surface.detected(goal)
     contacts = as_contacts(surface.mesh, surface.detector.detect(x0, x1))
-    if surface.min_distance:
+    if surface.keeps_distance:
         too_near = as_contacts(surface.mesh, surface.distance_detector.detect(x0, x1))
         too_near = too_near.rows(~np.isin(too_near.keys, near))
         contacts = Contacts.joined([contacts.rows(~np.isin(contacts.keys, too_near.keys)), too_near])
     moves = differ(start, goal)
-    return _with_gaps(surface, contacts.rows(np.asarray(moves[contacts.vertices].any(axis=1))), near)
+    contacts = _between_bodies(surface, contacts.rows(np.asarray(moves[contacts.vertices].any(axis=1))))
+    return _with_gaps(surface, contacts, near)
 
 
 def _with_gaps(surface: Surface, contacts: Contacts, near: np.ndarray) -> Contacts:
     """Returns contacts with the distances that they are to have: the minimum distance, unless they are near ones."""
     # short edges would be strained by the gap of longer ones
     gap = _GAP * surface.shortest[contacts.vertices].min(axis=1)
-    if surface.min_distance:
-        gap = np.where(np.isin(contacts.keys, near), gap, _MORE_DISTANCE * surface.min_distance)
+    if surface.keeps_distance:
+        gap = np.where(np.isin(contacts.keys, near), gap, _distances(surface, contacts))
     return replace(contacts, gap=gap)

@@ -10,13 +10,12 @@ import warp as wp
 from .._arguments import check_instance, checked_distance, checked_number
 from ..detection.mesh import CollisionMesh
 from ..response.report.inside import Inside
-from .arguments import checked_sheets
+from .arguments import checked_sets
 from .free import search
 from .model_surface import ModelSurface
-from .results import RepairResult
+from .results import RepairResult, describe
 from .sheets import joined_sheets
 from .tetrahedra import are_inverted
-from .unresolved import describe
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +80,7 @@ def repair_state(
     check_instance(model, "model", newton.Model, "a newton.Model")
     check_instance(state, "state", newton.State, "a newton.State")
     count = model.particle_count
-    sheet = None if order is None else checked_sheets(order, count)
+    sheet = None if order is None else checked_sets(order, "order", count)
     distance = checked_distance(min_distance, "min_distance")
     strain = checked_number(max_strain, "max_strain", 0.0, above=True)
     surface = ModelSurface(model, state, distance)

@@ -10,6 +10,7 @@ import warp as wp
 from ..detection.detector import CollisionDetector
 from ..detection.mesh import CollisionMesh
 from .contours import connected_components
+from .rigid import RigidGroups
 
 _WRECKED = 0.25
 """Median strain of edges that have moved above which a surface is no result."""
@@ -63,9 +64,15 @@ def _pairs_within(places: np.ndarray, labels: list[np.ndarray], tolerance: float
     return pairs[near]
 
 
-def welded(mesh: CollisionMesh, weld: np.ndarray) -> CollisionMesh:
-    """Returns the mesh whose faces and edges use no vertex that is welded to another one, with the same numbers."""
-    if mesh.radius is None and not mesh.only_free and (weld == np.arange(len(weld))).all():
+def welded(mesh: CollisionMesh, weld: np.ndarray, radius: np.ndarray | None = None) -> CollisionMesh:
+    """Returns the mesh whose faces and edges use no vertex that is welded to another one, with the same numbers.
+
+    Args:
+        mesh: The mesh.
+        weld: The vertex that each vertex is welded to, int, shape [n].
+        radius: Radius of each vertex in place of those of the mesh; default: none.
+    """
+    if mesh.radius is radius and not mesh.only_free and (weld == np.arange(len(weld))).all():
         return mesh
     edges = weld[mesh.edges[mesh.free_edges]]
     return CollisionMesh(
@@ -73,6 +80,7 @@ def welded(mesh: CollisionMesh, weld: np.ndarray) -> CollisionMesh:
         mesh.vertex_count,
         edges=edges[edges[:, 0] != edges[:, 1]],
         points=weld[mesh.points],
+        radius=radius,
         world=mesh.world,
         group=mesh.group,
         mask=mesh.mask,
@@ -96,16 +104,21 @@ class Surface:
         given: The mesh as it was given.
         weld: The vertex that each of its vertices is welded to, int, shape [n].
         mesh: The mesh, in which no face uses a doubled vertex.
-        edges: Vertices of the edges of the mesh, then of the other edges of tetrahedra, int, shape [m, 2].
+        edges: Vertices of the edges of the mesh, of the other edges of tetrahedra, and of links of rigid groups, int,
+            shape [m, 2].
         ends: The first and the second vertices of the edges, shape [2, m].
         tetrahedra: Vertices of tetrahedra, whose inner vertices follow, int, shape [m, 4].
         home: Input positions, in units, float64, shape [n, 3].
         fixed: Vertices that stay, and those that no element uses, bool, shape [n].
+        rigid: Groups that move as a whole.
+        body: Group of each vertex, -1 for those that move by themselves, and one for all that are fixed, int, shape
+            [n].
         unit: The unit, in the unit of the input.
         lengths: Length of each of the edges in the input, in units, float64, shape [m].
-        edge: Median length of the edges.
+        edge: Median length of the edges, but for links.
         shortest: Length of the shortest edge of each vertex, at most the median, in units, float64, shape [n].
-        min_distance: Distance that elements keep, in units, 0 for none.
+        min_distance: Distance that elements keep beside their radii, in units, 0 for none.
+        radius: Radius of each vertex, in units, float64, shape [n]; None if all are 0.
         end: Time at which a search ends with what it has found, as of ``time.monotonic`` [s].
     """
 
@@ -120,6 +133,7 @@ class Surface:
         *,
         weld: np.ndarray | None = None,
         tetrahedra: np.ndarray = _NO_TETRAHEDRA,
+        rigid: np.ndarray | None = None,
     ):
         """Prepares detection.
 
@@ -130,6 +144,7 @@ class Surface:
             min_distance: Distance that elements keep, in the unit of the input.
             weld: The vertex that each vertex is welded to, int, shape [n]; default: itself.
             tetrahedra: Vertices of tetrahedra, int, shape [m, 4]; default: none.
+            rigid: Group of each vertex that moves as a whole, -1 for none, int, shape [n]; default: none.
         """
         self.weld = weld = np.arange(len(x)) if weld is None else weld
         self.given, self.mesh, self._input = mesh, welded(mesh, weld), x
@@ -140,6 +155,15 @@ class Surface:
         if len(tetrahedra):
             is_used[self.tetrahedra] = True
             self.edges = _with_edges_of(self.tetrahedra, mesh.edges, len(x))
+        fixed = np.bincount(weld, fixed, len(x)) > 0
+        group = np.full(len(x), -1) if rigid is None else _joined_groups(rigid, weld)
+        fixed |= (group >= 0) & np.isin(group, group[fixed])
+        self.fixed = fixed | ~is_used
+        self.rigid = RigidGroups(np.where(self.fixed, -1, group))
+        self.body = np.where(self.fixed, len(x), self.rigid.of)
+        count = len(self.edges)
+        if len(self.rigid.links):
+            self.edges = np.concatenate([self.edges, self.rigid.links])
         self.ends = np.ascontiguousarray(self.edges.T)
         self._is_used = is_used[:, None]
         self._offset, self.unit = _frame_of(x[is_used])
@@ -149,11 +173,15 @@ class Surface:
         self._ends = np.clip(np.where(self._offset == 0.0, [[-most], [most]], ends), -most, most)
         self.home = self.in_units(x)
         self.min_distance = min_distance / self.unit
-        self.fixed = (np.bincount(weld, fixed, len(x)) > 0) | ~is_used
+        self.radius = None
+        if self.given.radius is not None:
+            self.radius = np.zeros(len(x))
+            np.maximum.at(self.radius, weld, self.given.radius / self.unit)
         self.lengths = self._lengths_of(self.home, slice(None))
-        self.edge = float(np.median(self.lengths)) if len(self.lengths) else 1.0
+        lengths, ends = self.lengths[:count], self.ends[:, :count]
+        self.edge = float(np.median(lengths)) if count else 1.0
         self.shortest = np.full(len(x), self.edge)
-        np.minimum.at(self.shortest, self.ends, np.broadcast_to(self.lengths, self.ends.shape))
+        np.minimum.at(self.shortest, ends, np.broadcast_to(lengths, ends.shape))
         self.detector = CollisionDetector(mesh)
         self._finder = self.detector.intersection_finder()
 
@@ -164,13 +192,23 @@ class Surface:
 
     @functools.cached_property
     def distance_detector(self) -> CollisionDetector:
-        """A detector of pairs that come within the minimum distance."""
-        return CollisionDetector(self.mesh, min_distance=self.min_distance)
+        """A detector of pairs that come within the distance that they keep."""
+        return CollisionDetector(self._thick_mesh, min_distance=self.min_distance)
 
     @functools.cached_property
     def reach_detector(self) -> CollisionDetector:
         """A detector of pairs that a motion may bring together."""
-        return CollisionDetector(self.mesh, min_distance=max(_REACH * self.edge, 1.01 * self.min_distance))
+        return CollisionDetector(self._thick_mesh, min_distance=max(_REACH * self.edge, 1.01 * self.min_distance))
+
+    @functools.cached_property
+    def _thick_mesh(self) -> CollisionMesh:
+        """The mesh with its radii."""
+        return welded(self.mesh, self.weld, self.radius)
+
+    @property
+    def keeps_distance(self) -> bool:
+        """Whether elements keep a distance."""
+        return self.min_distance > 0.0 or self.radius is not None
 
     @property
     def is_late(self) -> bool:
@@ -216,11 +254,20 @@ class Surface:
         places = (x[self.weld] * self.unit + self._offset).astype(self._input.dtype)
         return np.where(moved[:, None], places, self._input)
 
+    def moved(self, x: np.ndarray) -> np.ndarray:
+        """Returns the vertices that are not as in the input, or in a group with one that is not, bool, shape [n]."""
+        return ~self.rigid.least(~differ(x, self.home))
+
+    def carried(self, x: np.ndarray, pushed: np.ndarray) -> np.ndarray:
+        """Returns positions at which rigid groups follow those of their vertices that are pushed, bool, shape [n]."""
+        return self.rigid.carried(x, self.home, pushed)
+
     def rounded(self, x: np.ndarray) -> np.ndarray:
-        """Returns positions in units as they will be returned, rounded to the type of the input."""
-        rounded = self.home.copy()
+        """Returns positions in units as they will be returned: rigid groups as a whole, of the type of the input."""
+        rounded, dtype = self.home.copy(), self._input.dtype
+        coordinates = x[self.rigid.vertices] + self._offset / self.unit
+        x = self.rigid.placed(x, self.home, float(np.finfo(dtype).eps) * np.abs(coordinates))
         (rows,) = np.nonzero(differ(x, self.home))
-        dtype = self._input.dtype
         moved = np.clip(x[rows] * self.unit + self._offset, *self._ends).astype(dtype).astype(np.float64)
         placed = ((moved - self._offset) / self.unit).astype(dtype).astype(np.float64)
         rounded[rows] = np.where(x[rows] == self.home[rows], rounded[rows], placed)
@@ -247,9 +294,15 @@ class Surface:
         yield x, movable
 
     def are_fixed(self, crossings: np.ndarray) -> np.ndarray:
-        """Returns whether all vertices of edges and faces that cross are fixed, bool, shape [m]."""
-        ends, corners = self.mesh.edges[crossings[:, 0]], self.mesh.faces[crossings[:, 1]]
-        return np.asarray(self.fixed[ends].all(axis=1) & self.fixed[corners].all(axis=1))
+        """Returns whether all vertices of edges and faces that cross are fixed, or of one group, bool, shape [m]."""
+        vertices = np.hstack([self.mesh.edges[crossings[:, 0]], self.mesh.faces[crossings[:, 1]]])
+        return self.are_of_one(self.body, vertices)
+
+    @staticmethod
+    def are_of_one(label: np.ndarray, vertices: np.ndarray) -> np.ndarray:
+        """Returns which rows of vertices, shape [m, k], have one label that is not -1, bool, shape [m]."""
+        labels = label[vertices]
+        return np.asarray((labels == labels[:, :1]).all(axis=1) & (labels[:, 0] >= 0))
 
     @property
     def device(self) -> wp.Device:
@@ -278,6 +331,14 @@ def _frame_of(x: np.ndarray) -> tuple[np.ndarray, float]:
     unit = 2.0 ** min(np.floor(np.log2(size)) + 1.0, 1023.0) if size > 0.0 else 1.0
     placed = ((x - offset) / unit).astype(x.dtype)
     return (offset, unit) if (placed.astype(np.float64) * unit == x - offset).all() else unchanged
+
+
+def _joined_groups(rigid: np.ndarray, weld: np.ndarray) -> np.ndarray:
+    """Returns the rigid group of each vertex, -1 for none, in which those that share a doubled vertex are one."""
+    (members,) = np.nonzero(rigid >= 0)
+    _, first, group = np.unique(rigid[members], return_index=True, return_inverse=True)
+    links = weld[np.stack([members[first][group.reshape(-1)], members], axis=1)]
+    return np.where(np.isin(np.arange(len(rigid)), links), connected_components(len(rigid), links), -1)
 
 
 def _with_edges_of(tetrahedra: np.ndarray, edges: np.ndarray, count: int) -> np.ndarray:

@@ -120,6 +120,9 @@ def _contour_moves(
     moves, given = np.zeros_like(x), np.zeros(len(x), dtype=bool)
     moves[involved] = total / np.maximum(weight, 0.5)[:, None]
     given[involved] = ~surface.fixed[involved]
+    bound = surface.rigid.vertices
+    moves[bound] = (surface.carried(x + moves, given) - x)[bound]
+    given[bound] = moves[bound].any(axis=1)
     return moves, given
 
 
