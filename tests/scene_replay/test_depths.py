@@ -9,7 +9,8 @@ from pxr import UsdGeom, Vt
 from usd_stages import new_stage, save
 
 import warp_bsc as bsc
-from warp_bsc.scene_replay.depths import DepthFinder
+from warp_bsc.scene_replay import depths as depths_module
+from warp_bsc.scene_replay.depths import DepthFinder, DepthRecorder
 
 BALL = trimesh.creation.icosphere(subdivisions=3, radius=1.0)
 
@@ -38,6 +39,26 @@ def depths(folder, meshes):
 
 
 UP = [0, 1, 2]
+
+
+@pytest.mark.parametrize(("most_work", "times"), [(1_000_000, [0, 1, 2, 3, 4]), (0, [0, 1])])
+def test_depths_of_large_scenes_are_measured_where_more_crosses(tmp_path, monkeypatch, most_work, times):
+    """A ball sinks to its middle and beyond: its depth is the largest where the sheet cuts the most of its edges."""
+    monkeypatch.setattr(depths_module, "_MOST_WORK", most_work)
+    stage = new_stage(tmp_path / "scene.usda")
+    for name, (vertices, faces) in {"Ball": (BALL.vertices, BALL.faces), "Sheet": grid(UP, 4.0)}.items():
+        mesh = UsdGeom.Mesh.Define(stage, f"/World/{name}")
+        for time, height in enumerate((0.9, 0.0, -0.1, 0.0, 0.05)):
+            moved = np.asarray(vertices) + [0, 0, height * (name == "Ball")]
+            mesh.CreatePointsAttr().Set(Vt.Vec3fArray.FromNumpy(moved.astype(np.float32)), time)
+        mesh.CreateFaceVertexCountsAttr([3] * len(faces))
+        mesh.CreateFaceVertexIndicesAttr(np.asarray(faces).reshape(-1).tolist())
+    recorder, measured, find = DepthRecorder(), [], DepthFinder.find
+    monkeypatch.setattr(DepthFinder, "find", lambda own, found: measured.append(found.time) or find(own, found))
+    for result in bsc.replay(bsc.Scene(save(stage)), device="cpu"):
+        recorder.add(result)
+    assert recorder.largest() == {("/World/Ball", "/World/Sheet"): (pytest.approx(1.0, abs=1e-5), 1.0)}
+    assert measured == times
 
 
 @pytest.mark.parametrize("height", [0.85, -0.4])
