@@ -49,7 +49,7 @@ def test_depths_of_large_scenes_are_measured_where_more_crosses(tmp_path, monkey
     for name, (vertices, faces) in {"Ball": (BALL.vertices, BALL.faces), "Sheet": grid(UP, 4.0)}.items():
         mesh = UsdGeom.Mesh.Define(stage, f"/World/{name}")
         for time, height in enumerate((0.9, 0.0, -0.1, 0.0, 0.05)):
-            moved = np.asarray(vertices) + [0, 0, height * (name == "Ball")]
+            moved = np.asarray(vertices) + np.array([0, 0, height * (name == "Ball")])
             mesh.CreatePointsAttr().Set(Vt.Vec3fArray.FromNumpy(moved.astype(np.float32)), time)
         mesh.CreateFaceVertexCountsAttr([3] * len(faces))
         mesh.CreateFaceVertexIndicesAttr(np.asarray(faces).reshape(-1).tolist())
