@@ -97,5 +97,10 @@ def make():
     return film.Film(last * _BETWEEN + 1, draw, duration=40, pause=1500)
 
 
-if __name__ == "__main__":
+def main():
+    """Reads the command line, and renders the film."""
     film.main(__doc__, make)
+
+
+if __name__ == "__main__":
+    main()

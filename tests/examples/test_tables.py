@@ -104,13 +104,17 @@ def test_the_front_page():
     two = measured("detector_two_cores")
     gpu = with_gpu(two)
     gpu["record"] = gpu["record"] | {"gpus": ["NVIDIA H200"]}
-    bullet, drape = measured("penetration_bullet"), measured("penetration_drape")
-    _, *rows = rows_of.front(gpu, two, bullet, drape)
+    twist, drape = measured("penetration_twist"), measured("penetration_drape")
+    _, *rows = rows_of.front(gpu, two, twist, drape)
     assert rows[0] == (rows[0][0], "1.2 ms on an H200") and "113,854 contacts" in rows[0][0]
     assert "IPC Toolkit" in rows[1][1]
-    for row, found, what in ((rows[2], bullet, "collisions"), (rows[3], drape, "crossings")):
-        counts = {run["simulator"]: run["measured"][what] for run in found["runs"] if run["measured"]}
-        assert row[1].startswith(f"VBD {np.max(counts['vbd']):,}, ") and row[1].endswith("`SolverCCD` 0")
+    for row, found in ((rows[2], twist), (rows[3], drape)):
+        runs = {run["simulator"]: run["measured"] for run in found["runs"] if run["measured"]}
+        for name, title in (("vbd-self-contact", "VBD with its self-contact"), ("implicit", "`SolverImplicit`")):
+            run = runs[name]
+            seconds = rows_of.two(1e-3 * run["milliseconds"]["median"] * run["steps"])
+            assert f"{title} {np.max(run['crossings']):,}, {seconds} s; " in row[1]
+        assert "`SolverCCD` behind VBD 0, " in row[1] and row[1].endswith("; on an H200")
 
 
 def test_intersections():
