@@ -13,7 +13,6 @@ from ..detection.run.launch import launch
 from ..response.report.inside import Inside, InsideFinder
 from ..response.state.mesh import ModelMesh, Placement, elements_of
 from ..response.state.motion import plane_in
-from .contours import connected_components
 from .solids import leave_solid, leave_solid_whole, spread_exits
 from .surface import Surface, differ, weld_borders
 
@@ -96,7 +95,7 @@ class ModelSurface(Surface):
             Positions in units, and which vertices may have moved, bool, shape [n].
         """
         movable, corners = np.zeros(len(x), dtype=bool), self.given.faces[:, 0]
-        body = connected_components(len(x), self.edges)
+        body = connect_cells(self.edges, len(x))
         is_held = np.isin(body, body[self.fixed])
         for _ in range(_ESCAPES):
             inside = self.particles_inside(x)

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 import warp as wp
 
+from ..detection.at_rest.body_parts import connect_cells
 from ..detection.detector import CollisionDetector
 from ..detection.mesh import CollisionMesh
-from .contours import connected_components
 from .rigid import RigidGroups
 
 _WRECKED = 0.25
@@ -41,7 +41,7 @@ def weld_borders(mesh: CollisionMesh, positions: np.ndarray, *labels: np.ndarray
         marks = [values[vertices] for values in (*labels, *bits)]
         places = positions[vertices]
         if tolerance:
-            places = connected_components(len(vertices), _pairs_within(places, marks, tolerance))
+            places = connect_cells(_pairs_within(places, marks, tolerance), len(vertices))
         keys = np.column_stack([places, *marks])
         _, firsts, numbers = np.unique(keys, axis=0, return_index=True, return_inverse=True)
         weld[vertices] = vertices[firsts[numbers.reshape(-1)]]
@@ -338,7 +338,7 @@ def _joined_groups(rigid: np.ndarray, weld: np.ndarray) -> np.ndarray:
     (members,) = np.nonzero(rigid >= 0)
     _, first, group = np.unique(rigid[members], return_index=True, return_inverse=True)
     links = weld[np.stack([members[first][group.reshape(-1)], members], axis=1)]
-    return np.where(np.isin(np.arange(len(rigid)), links), connected_components(len(rigid), links), -1)
+    return np.where(np.isin(np.arange(len(rigid)), links), connect_cells(links, len(rigid)), -1)
 
 
 def _with_edges_of(tetrahedra: np.ndarray, edges: np.ndarray, count: int) -> np.ndarray:
