@@ -1,7 +1,6 @@
 """A run of warp-bsc repair: finds collisions, repairs, and writes the USD layer and what it takes to resume."""
 
 import argparse
-import errno
 import functools
 import time
 from collections.abc import Callable, Iterator
@@ -21,7 +20,7 @@ from ..scene_replay.results import IntervalResult
 from ..usd.scene import Scene
 from ..usd.write.points_layer import PointsLayer
 from .device import loading_kernels
-from .error_boundary import describe
+from .error_boundary import describe, finish_outputs
 from .interrupts import INTERRUPTS, Interrupted
 from .progress import RunProgress
 
@@ -193,24 +192,13 @@ class RepairRun:
 
     def _finish(self) -> None:
         """Writes the layer, without its last frames if the disk is full."""
-        shortage = ""
-        while True:
-            facts = self.found | {"stretches": len(self.stretches)}
+        facts = self.found | {"stretches": len(self.stretches)}
+
+        def finish(layer: PointsLayer | FrameFiles, shortage: str) -> None:
             stopped = shortage or str(self.interrupt or "") or "; ".join(self.problems)
-            try:
-                with naming(self._arguments.output):
-                    self._layer.finish(facts | ({"stopped": stopped} if stopped else {}))
-            except Exception as error:
-                number = error.errno if isinstance(error, OSError) else None
-                is_full = number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-                if is_full and self._layer.shrink():
-                    shortage = describe(error)
-                    continue
-                self.problems.append(f"{self._arguments.output}: not written: {describe(error)}")
-                return
-            if shortage:
-                self.problems.append(f"not all of it is written: {shortage}")
-            return
+            layer.finish(facts | ({"stopped": stopped} if stopped else {}))
+
+        self.problems += finish_outputs({self._arguments.output: self._layer}, finish)
 
     def report(self, page: RepairPage, kept: dict[str, str], after: list[Finding] | None) -> None:
         """Writes the page of what is done; ``after`` is what a replay finds in the layer, None if it was not replayed.
