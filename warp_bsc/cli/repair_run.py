@@ -10,10 +10,10 @@ from typing import Any
 
 from .._atomic_file import naming, unfinished_path
 from ..mesh_files.file_scene import FrameFiles
-from ..repairing.shot.findings import Finding, MeshPair, find_collisions
+from ..repairing.shot.findings import Finding, MeshPair, count_found, find_collisions
 from ..repairing.shot.journal import Journal
 from ..repairing.shot.repair_shot import repair_shot
-from ..repairing.shot.report import UNREPAIRED_HITS, RepairPage
+from ..repairing.shot.report import RepairPage
 from ..repairing.shot.stretch import RepairedStretch
 from ..scene_replay.intervals import replay
 from ..scene_replay.results import IntervalResult
@@ -260,17 +260,6 @@ def find(
     """Returns what an exact replay of a scene finds, and shows its progress; pairs as of :func:`.find_collisions`."""
     options = {"keep": arguments.keep, "unrepaired_pairs": unrepaired_pairs, "min_distance": arguments.min_distance}
     return list(find_collisions(scene, tracked(scene, activity, device), **options, device=device))
-
-
-def count_found(findings: list[Finding], min_distance: float) -> dict[str, int]:
-    """Returns the numbers of collisions and intersections, and of others that there may be, by their names."""
-    crossings = sum(finding.crossings[0] for finding in findings) + findings[-1].crossings[1]
-    counts = {"collisions": sum(finding.hits for finding in findings), "intersections": crossings}
-    if min_distance:
-        counts[f"pairs nearer than {min_distance:g}"] = sum(finding.near for finding in findings)
-    if findings[0].unrepaired_pairs:
-        counts[UNREPAIRED_HITS] = sum(finding.unrepaired_hits for finding in findings)
-    return counts
 
 
 def _interval_after(scene: Scene, stretch: RepairedStretch) -> int:

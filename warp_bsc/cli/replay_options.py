@@ -3,7 +3,9 @@
 import argparse
 import importlib
 import math
+import os
 import shlex
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
@@ -124,20 +126,28 @@ def read_selection(arguments: argparse.Namespace) -> Selection:
     )
 
 
-def read_scene(path: str, arguments: argparse.Namespace, *, as_json: bool = False, **options: Any) -> Scene:
+def read_scene(
+    path: str, arguments: argparse.Namespace, *, written: Sequence[str] = (), as_json: bool = False, **options: Any
+) -> Scene:
     """Opens a scene with the options of :func:`add_scene_selection` that say how it is read, and shows the progress.
 
     Args:
         path: The file.
         arguments: The options.
+        written: The files that are to be written.
         as_json: Whether the progress is for programs.
         options: Other arguments of the scene.
 
     Raises:
         ImportError: If OpenUSD is missing or too old.
         OSError: If the file cannot be read.
-        ValueError: If the options do not fit the scene, or the file is broken.
+        ValueError: If the options do not fit the scene, the file is broken, or one would be written twice, or over one
+            that is read.
     """
+    paths = [os.path.realpath(file) for file in [path, *written]]
+    for file in paths:
+        if paths.count(file) > 1:
+            raise ValueError(f"{file}: named twice, as two files of a {arguments.command_line[1]}")
     with INTERRUPTS.held():  # an interrupt while USD's modules load is caught there, and breaks them
         check_openusd()
         importlib.import_module("warp_bsc.usd.read.find_meshes")
@@ -145,11 +155,15 @@ def read_scene(path: str, arguments: argparse.Namespace, *, as_json: bool = Fals
     how = {"strict": arguments.strict, "allow_missing": arguments.allow_missing}
     try:
         with RunProgress("Comparing vertices", as_json=as_json) as progress:
-            return Scene(path, **how, **options, progress=progress.show)
+            scene = Scene(path, **how, **options, progress=progress.show)
     except (OSError, ValueError):
         raise
     except Exception as error:
         raise ValueError(f"{path}: {describe(error)}") from error
+    for file in written:
+        if file in scene.files:
+            raise ValueError(f"{file}: the scene is read from this file; write to another one")
+    return scene
 
 
 def describe_selection(scene: Scene, arguments: argparse.Namespace) -> dict[str, Any]:

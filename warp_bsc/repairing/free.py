@@ -140,14 +140,13 @@ def _opened(
     surface: Surface, start: np.ndarray, crossings: np.ndarray, movable: np.ndarray | None
 ) -> tuple[np.ndarray, Springs]:
     """Returns positions at which less crosses, or is near, and springs of what may move; as :func:`free` otherwise."""
-    untangled = untangle(surface, start, crossings)
-    x = push_apart(surface, untangled.x) if surface.keeps_distance else untangled.x
-    (pushed,) = np.nonzero(differ(x, untangled.x))
-    may_move = untangled.springs.movable | near(surface, pushed, _RINGS)
+    untangled, springs = untangle(surface, start, crossings)
+    x = push_apart(surface, untangled) if surface.keeps_distance else untangled
+    (pushed,) = np.nonzero(differ(x, untangled))
+    may_move = springs.movable | near(surface, pushed, _RINGS)
     if movable is not None:
         may_move |= movable
-    is_known = (may_move == untangled.springs.movable).all()
-    return x, untangled.springs if is_known else Springs(surface, may_move)
+    return x, springs if (may_move == springs.movable).all() else Springs(surface, may_move)
 
 
 def _returned(surface: Surface, x: np.ndarray, springs: Springs, max_strain: float, **options) -> np.ndarray:
