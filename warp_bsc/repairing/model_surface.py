@@ -8,7 +8,7 @@ import warp as wp
 
 from .._arguments import check_finite
 from ..detection.at_rest.body_parts import connect_cells
-from ..detection.mesh import CollisionMesh
+from ..detection.mesh import CollisionMesh, changed_mesh
 from ..detection.run.launch import launch
 from ..response.report.inside import Inside, InsideFinder
 from ..response.state.mesh import ModelMesh, Placement, elements_of
@@ -167,12 +167,6 @@ def _with_planes(
             worlds.append(np.full(4, w))
             count += 4
     world = np.concatenate(worlds)
-    whole = CollisionMesh(
-        np.concatenate(faces),
-        count,
-        edges=mesh.edges[mesh.free_edges],
-        points=mesh.points,
-        world=None if mesh.world is None else world,
-        device=mesh.device,
-    )
+    of_mesh = None if mesh.world is None else world
+    whole = changed_mesh(mesh, faces=np.concatenate(faces), vertex_count=count, world=of_mesh)
     return whole, np.concatenate(positions), np.concatenate(shapes), world

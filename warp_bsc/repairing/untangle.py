@@ -104,7 +104,7 @@ def _contour_moves(
     moves[involved] = total / np.maximum(weight, 0.5)[:, None]
     given[involved] = ~surface.fixed[involved]
     bound = surface.rigid.vertices
-    moves[bound] = (surface.carried(x + moves, given) - x)[bound]
+    moves[bound] = (surface.rigid.carried(x + moves, surface.home, given) - x)[bound]
     given[bound] = moves[bound].any(axis=1)
     return moves, given
 
