@@ -2,7 +2,6 @@
 
 import argparse
 import importlib
-import math
 import os
 import shlex
 from collections.abc import Sequence
@@ -180,12 +179,10 @@ def command_of(arguments: argparse.Namespace) -> str:
     if not arguments.intersections:
         words.append("--no-intersections")
     words += [_option("ignore_initial")] * arguments.ignore_initial
-    for name, default in (("method", "exact"), ("subdivide", 1), ("validate", 0)):
+    defaults = {"method": "exact", "subdivide": 1, "validate": 0, "clearance": None, "limit": None}
+    for name, default in defaults.items():
         value = getattr(arguments, name)
         words += [_option(name), str(value)] if value != default else []
-    for name in ("clearance", "limit"):
-        value = getattr(arguments, name)
-        words += [_option(name), str(value)] if value is not None else []
     return shlex.join(words + _selection_words(arguments))
 
 
@@ -220,20 +217,12 @@ def _output(text: str) -> str:
 
 def _frames(text: str) -> FrameRange:
     parts = text.split(":")
-    if len(parts) > 3:
+    if not 2 <= len(parts) <= 3:
         raise argparse.ArgumentTypeError(f"must be START:END:STEP, not {text!r}")
     try:
-        numbers = [float(part) if part else None for part in parts]
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"must be START:END:STEP, three numbers, not {text!r}") from None
-    start, end, step = numbers + [None] * (3 - len(numbers))
-    if any(number is not None and not math.isfinite(number) for number in numbers):
-        raise argparse.ArgumentTypeError(f"must be finite numbers, not {text!r}")
-    if step is not None and step <= 0:
-        raise argparse.ArgumentTypeError(f"STEP must be more than 0, not {step:g}")
-    if len(parts) < 2 or (start is not None and end is not None and end < start):
-        raise argparse.ArgumentTypeError(f"must be START:END:STEP with END not before START, not {text!r}")
-    return FrameRange(start, end, step)
+        return FrameRange(*(float(part) if part else None for part in parts))
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"must be START:END:STEP, three numbers, not {text!r}: {error}") from None
 
 
 def _validate(text: str) -> int | Literal["all"]:
