@@ -81,6 +81,9 @@ class OutputFile:
         while rest:
             rest = rest[self._file.write(rest) :]
 
+    def flush(self) -> None:
+        """Does nothing, for writers that ask for it: nothing is buffered."""
+
     def tell(self) -> int:
         """Returns the number of bytes that have been written."""
         return self._file.tell()

@@ -453,14 +453,14 @@ _MESH_COLUMNS = (
 )
 """Columns of a run and an attempt."""
 _COST_COLUMNS = (
-    Column("freed", lambda found: f"{found.freed} of {found.meshes}"),
+    Column("freed", "{0[freed]} of {0[meshes]}".format),
     Column("crossings", "crossings", "{0[0]:,} to {0[1]:,}".format),
     Column("largest move, median and most", "move", lambda ends: ", ".join(map(two, ends))),
     Column("strain, median and most", "strain", lambda ends: f"{two(100.0 * ends[0])}, {two(100.0 * ends[1])}%"),
     Column(f"more than {100 * STRAIN:.0f}%", "strained"),
     Column("median time", "seconds", "{:.2f} s".format),
 )
-"""Columns of a ``DamageSummary``."""
+"""Columns of what ``summarize`` returns."""
 
 
 def repair_named(found: Found, *kinds: str) -> Rows:

@@ -130,6 +130,13 @@ def test_what_repairs_have_in_common():
             ),
         ]
     )
-    assert (found.meshes, found.freed, found.freed_by_hint) == (3, 2, {"order": 2, "x_previous": 3})
-    assert (found.crossings, found.move, found.strain) == ((4, 90), (1.0, 9.0), (0.05, 0.11))
-    assert (found.strained, found.seconds) == (1, 0.3)
+    assert found == {
+        "meshes": 3,
+        "freed": 2,
+        "freed_by_hint": {"order": 2, "x_previous": 3},
+        "crossings": (4, 90),
+        "move": (1.0, 9.0),
+        "strain": (0.05, 0.11),
+        "strained": 1,
+        "seconds": 0.3,
+    }

@@ -59,7 +59,7 @@ def test_pairs(crowd, options, expected):
         (["--between", "/World/A", "/World/Z"], "--between: no mesh matches /World/Z"),
         (["--frames", "5:9"], "--frames"),
         (["--frames", "3:1"], "--frames"),
-        (["--frames", "0:1:0"], "STEP must be more than 0"),
+        (["--frames", "0:1:0"], "step must be finite and more than 0"),
         (["--frames", "a:b"], "three numbers"),
         (["--subdivide", "0"], "at least 1"),
         (["--validate", "some"], "--validate"),

@@ -1,12 +1,14 @@
 """Turns each error or signal that ends a command into an exit status and one line. Imports little."""
 
 import contextlib
+import errno
 import io
 import os
 import sys
 import traceback
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 from .._atomic_file import naming
 from .exit_status import ExitStatus
@@ -57,6 +59,41 @@ def describe(error: BaseException) -> str:
     folder = Path(__file__).parents[1]
     own = [frame for frame in traceback.extract_tb(error.__traceback__) if folder in Path(frame.filename).parents]
     return f"{text} ({Path(own[-1].filename).name}:{own[-1].lineno})" if own else text
+
+
+def finish_outputs(outputs: dict[str, Any], finish: Callable[[Any, str], None]) -> list[str]:
+    """Finishes files, without their last parts if the disk is full; returns messages on missing parts.
+
+    On a full disk all files shrink down to half of their intervals. After that only the file that does not fit
+    shrinks, or is omitted; the page comes first, as it matters least.
+
+    Args:
+        outputs: The files by their names, the page last; each can ``shrink``.
+        finish: Finishes a file, given also why it has shrunk; empty if it has not.
+    """
+    problems, shortages = [], {}
+    shared = 5  # number of eighths that all files lose, which leave about a half
+    waiting = list(outputs)[::-1]  # the tables, which are the largest, come last
+    while waiting:
+        name = waiting[0]
+        try:
+            finish(outputs[name], shortages.get(name, ""))
+        except Exception as error:
+            if isinstance(error, BrokenPipeError) and name == "standard output":
+                raise  # its reader has closed it, which is not an error
+            number = error.errno if isinstance(error, OSError) else None
+            sharing, smaller = [name], []
+            if number in (errno.ENOSPC, errno.EDQUOT) and shared:
+                sharing, shared = waiting, shared - 1
+            if number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+                smaller = [other for other in sharing if outputs[other].shrink()]
+            if smaller:
+                shortages |= dict.fromkeys(smaller, describe(error))
+                continue
+            shortages.pop(name, None)
+            problems.append(f"{name}: not written: {describe(error)}")
+        waiting.pop(0)
+    return problems + [f"{name}: not all of it is written: {shortage}" for name, shortage in shortages.items()]
 
 
 @contextlib.contextmanager

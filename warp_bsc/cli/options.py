@@ -1,6 +1,7 @@
 """Options that several commands share, with their types and help texts."""
 
 import argparse
+import functools
 import math
 import os
 from collections.abc import Callable, Iterable, Mapping
@@ -165,15 +166,19 @@ def names_of(known: Iterable[str], help: str, *, metavar: str = "NAME,...", all_
         all_by_default: Whether the default is all that there are, not None.
     """
     known = tuple(known)
+    return {
+        "type": functools.partial(_names, known),
+        "help": help,
+        "default": known if all_by_default else None,
+        "metavar": metavar,
+    }
 
-    def parse(text: str) -> tuple[str, ...]:
-        names = tuple(dict.fromkeys(text.split(",")))
-        for name in names:
-            if name not in known:
-                raise argparse.ArgumentTypeError(f"must be of {', '.join(known)}, not {name!r}")
-        return names
 
-    return {"type": parse, "help": help, "default": known if all_by_default else None, "metavar": metavar}
+def _names(known: tuple[str, ...], text: str) -> tuple[str, ...]:
+    names = tuple(dict.fromkeys(text.split(",")))
+    if unknown := [name for name in names if name not in known]:
+        raise argparse.ArgumentTypeError(f"must be of {', '.join(known)}, not {', '.join(unknown)!r}")
+    return names
 
 
 DEVICE: Options = {
@@ -205,19 +210,11 @@ def add_fail_on(group: argparse._ActionsContainer, reasons: dict[str, str]) -> N
         group: The command, or a group of its options.
         reasons: The kinds of finding, and an explanation of each, which may be empty.
     """
-
-    def parse(text: str) -> frozenset[str]:
-        named = frozenset(text.split(","))
-        if unknown := named - reasons.keys():
-            known = ", ".join(reasons)
-            raise argparse.ArgumentTypeError(f"must be of {known}, not {', '.join(sorted(unknown))!r}")
-        return named
-
     explained = ", ".join(f"{reason} ({text})" if text else reason for reason, text in reasons.items())
     several = " of these, separated by commas" if len(reasons) > 1 else ""
     group.add_argument(
         "--fail-on",
-        type=parse,
+        type=lambda text: frozenset(_names(tuple(reasons), text)),
         default=frozenset(),
         metavar="WHAT",
         help=f"exit with status 1 if there is any{several}: {explained}",

@@ -4,7 +4,6 @@ import json
 import sys
 import time
 
-import rich.console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from .tables import Console, say
@@ -14,29 +13,29 @@ LOG_SECONDS = 10.0
 
 
 class RunProgress:
-    """Shows the progress of a run: a bar on a terminal, else a line on standard error every ten seconds."""
+    """Shows the progress of a run: a bar on a terminal, else a line on standard error every ten seconds.
+
+    Attributes:
+        console: Prints on standard error, on a terminal above the bar.
+    """
 
     def __init__(self, activity: str, *, as_json: bool = False):
         """Prepares the bar; ``as_json`` writes an object of JSON in a line each time instead, for programs."""
         self._activity, self._as_json = activity, as_json
+        self.console = Console(stderr=True)
         self._bar = Progress(
             TextColumn(activity),
             BarColumn(bar_width=None),
             MofNCompleteColumn(),
             TextColumn("{task.fields[note]}"),
             TimeRemainingColumn(),
-            console=Console(stderr=True),
+            console=self.console,
             transient=True,
         )
-        self._bar.disable = as_json or not self._bar.console.is_terminal
+        self._bar.disable = as_json or not self.console.is_terminal
         self._task = self._bar.add_task("", total=None, note="")
         self._started = self._last_line = time.monotonic()
         self._first: tuple[float, float] | None = None  # what was done first, and when: before that, things load
-
-    @property
-    def console(self) -> rich.console.Console:
-        """Prints on standard error, on a terminal above the bar."""
-        return self._bar.console
 
     def __enter__(self) -> "RunProgress":
         self._bar.start()

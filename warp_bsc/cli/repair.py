@@ -3,14 +3,13 @@
 import argparse
 import contextlib
 import json
-import os
 from typing import Any
 
 from .._atomic_file import STDOUT, unfinished_path
 from ..mesh_files.file_scene import FileScene, FrameFiles
 from ..mesh_files.frames import find_frames, make_folder
 from ..mesh_files.mesh_file import is_mesh_file
-from ..repairing.shot.findings import kept_meshes
+from ..repairing.shot.findings import count_found, kept_meshes
 from ..repairing.shot.report import RepairPage
 from ..scene_replay.hit_files import replay_facts
 from ..usd.read.tetrahedra import NOT_REPAIRED
@@ -34,7 +33,7 @@ from .options import (
     scene_path,
 )
 from .repair_files import check_page, read_frames, repair_files
-from .repair_run import RepairRun, count_found, find
+from .repair_run import RepairRun, find
 from .repair_tables import print_repair
 from .replay_options import add_scene_selection, describe_selection, read_scene, read_selection
 from .tables import Console
@@ -220,12 +219,4 @@ def _open_usd(arguments: argparse.Namespace, chosen: dict[str, Any]) -> Scene:
     written = [file for file in (arguments.output, arguments.report) if file]
     written.append(str(unfinished_path(arguments.output)))
     arguments.scene = scene_path(arguments.scene[0])
-    paths = [os.path.realpath(file) for file in [arguments.scene, *written]]
-    for path in paths:
-        if paths.count(path) > 1:
-            raise ValueError(f"{path}: named twice, as two files of a repair")
-    scene = read_scene(arguments.scene, arguments, **chosen)
-    for file in written:
-        if file in scene.files:
-            raise ValueError(f"{file}: the scene is read from this file; write to another one")
-    return scene
+    return read_scene(arguments.scene, arguments, written=written, **chosen)

@@ -11,12 +11,12 @@ import warp as wp
 
 from .._atomic_file import STDOUT, OutputFile, naming
 from ..bench.tables import LONGEST, Column, count
+from ..detection.at_rest.body_parts import connect_cells
 from ..detection.mesh import CollisionMesh
 from ..mesh_files.check import find_meeting
 from ..mesh_files.file_scene import FileScene
 from ..mesh_files.frames import Frames, make_folder
 from ..mesh_files.mesh_file import MeshFile, MeshScene, is_mesh_file
-from ..repairing.contours import connected_components
 from ..repairing.repair import repair
 from ..repairing.results import RepairResult
 from ..repairing.shot.findings import kept_meshes
@@ -60,7 +60,7 @@ def repair_files(frames: Frames, arguments: argparse.Namespace) -> int:
     kept = np.array([output is None for output in outputs])
     are_rigid = np.array(frames.matching(arguments.rigid, "--rigid"))
     mesh = _mesh_of(scene, kept, device)
-    pieces = connected_components(len(scene.x), mesh.edges)
+    pieces = connect_cells(mesh.edges, len(scene.x))
     make_folder(arguments.output)
     with contextlib.ExitStack() as stack:
         files, page = [], None

@@ -1,7 +1,6 @@
 """A run of warp-bsc repair: finds collisions, repairs, and writes the USD layer and what it takes to resume."""
 
 import argparse
-import errno
 import functools
 import time
 from collections.abc import Callable, Iterator
@@ -11,17 +10,17 @@ from typing import Any
 
 from .._atomic_file import naming, unfinished_path
 from ..mesh_files.file_scene import FrameFiles
-from ..repairing.shot.findings import Finding, MeshPair, find_collisions
+from ..repairing.shot.findings import Finding, MeshPair, count_found, find_collisions
 from ..repairing.shot.journal import Journal
 from ..repairing.shot.repair_shot import repair_shot
-from ..repairing.shot.report import UNREPAIRED_HITS, RepairPage
+from ..repairing.shot.report import RepairPage
 from ..repairing.shot.stretch import RepairedStretch
 from ..scene_replay.intervals import replay
 from ..scene_replay.results import IntervalResult
 from ..usd.scene import Scene
 from ..usd.write.points_layer import PointsLayer
 from .device import loading_kernels
-from .error_boundary import describe
+from .error_boundary import describe, finish_outputs
 from .interrupts import INTERRUPTS, Interrupted
 from .progress import RunProgress
 
@@ -193,24 +192,13 @@ class RepairRun:
 
     def _finish(self) -> None:
         """Writes the layer, without its last frames if the disk is full."""
-        shortage = ""
-        while True:
-            facts = self.found | {"stretches": len(self.stretches)}
+        facts = self.found | {"stretches": len(self.stretches)}
+
+        def finish(layer: PointsLayer | FrameFiles, shortage: str) -> None:
             stopped = shortage or str(self.interrupt or "") or "; ".join(self.problems)
-            try:
-                with naming(self._arguments.output):
-                    self._layer.finish(facts | ({"stopped": stopped} if stopped else {}))
-            except Exception as error:
-                number = error.errno if isinstance(error, OSError) else None
-                is_full = number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-                if is_full and self._layer.shrink():
-                    shortage = describe(error)
-                    continue
-                self.problems.append(f"{self._arguments.output}: not written: {describe(error)}")
-                return
-            if shortage:
-                self.problems.append(f"not all of it is written: {shortage}")
-            return
+            layer.finish(facts | ({"stopped": stopped} if stopped else {}))
+
+        self.problems += finish_outputs({self._arguments.output: self._layer}, finish)
 
     def report(self, page: RepairPage, kept: dict[str, str], after: list[Finding] | None) -> None:
         """Writes the page of what is done; ``after`` is what a replay finds in the layer, None if it was not replayed.
@@ -272,17 +260,6 @@ def find(
     """Returns what an exact replay of a scene finds, and shows its progress; pairs as of :func:`.find_collisions`."""
     options = {"keep": arguments.keep, "unrepaired_pairs": unrepaired_pairs, "min_distance": arguments.min_distance}
     return list(find_collisions(scene, tracked(scene, activity, device), **options, device=device))
-
-
-def count_found(findings: list[Finding], min_distance: float) -> dict[str, int]:
-    """Returns the numbers of collisions and intersections, and of others that there may be, by their names."""
-    crossings = sum(finding.crossings[0] for finding in findings) + findings[-1].crossings[1]
-    counts = {"collisions": sum(finding.hits for finding in findings), "intersections": crossings}
-    if min_distance:
-        counts[f"pairs nearer than {min_distance:g}"] = sum(finding.near for finding in findings)
-    if findings[0].unrepaired_pairs:
-        counts[UNREPAIRED_HITS] = sum(finding.unrepaired_hits for finding in findings)
-    return counts
 
 
 def _interval_after(scene: Scene, stretch: RepairedStretch) -> int:

@@ -1,7 +1,6 @@
 """The command ``warp-bsc replay``: finds the collisions in a USD scene and writes them to tables and files."""
 
 import argparse
-import os
 from typing import Any
 
 from .._atomic_file import STDOUT, unfinished_path
@@ -78,22 +77,15 @@ def _open_scene(arguments: argparse.Namespace) -> Scene:
     if outputs.count(STDOUT) > 1:
         raise ValueError("--json, --csv and --report: only one of them can be printed on standard output")
     written = [*outputs, str(unfinished_path(arguments.json))] if is_saved else outputs
-    paths = [os.path.realpath(file) for file in [arguments.scene, *written] if file != STDOUT]
-    for path in paths:
-        if paths.count(path) > 1:
-            raise ValueError(f"{path}: named twice, as two files of a replay")
-    scene = read_scene(
+    return read_scene(
         arguments.scene,
         arguments,
         selection=read_selection(arguments),
         frames=arguments.frames,
         subdivide=arguments.subdivide,
         as_json=arguments.progress == "json",
+        written=[file for file in written if file != STDOUT],
     )
-    for file in written:
-        if file in scene.files:
-            raise ValueError(f"{file}: the scene is read from this file; write to another one")
-    return scene
 
 
 def _describe_options(scene: Scene, arguments: argparse.Namespace) -> dict[str, Any]:

@@ -2,8 +2,9 @@
 
 import argparse
 import importlib
-import math
+import os
 import shlex
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
@@ -124,20 +125,28 @@ def read_selection(arguments: argparse.Namespace) -> Selection:
     )
 
 
-def read_scene(path: str, arguments: argparse.Namespace, *, as_json: bool = False, **options: Any) -> Scene:
+def read_scene(
+    path: str, arguments: argparse.Namespace, *, written: Sequence[str] = (), as_json: bool = False, **options: Any
+) -> Scene:
     """Opens a scene with the options of :func:`add_scene_selection` that say how it is read, and shows the progress.
 
     Args:
         path: The file.
         arguments: The options.
+        written: The files that are to be written.
         as_json: Whether the progress is for programs.
         options: Other arguments of the scene.
 
     Raises:
         ImportError: If OpenUSD is missing or too old.
         OSError: If the file cannot be read.
-        ValueError: If the options do not fit the scene, or the file is broken.
+        ValueError: If the options do not fit the scene, the file is broken, or one would be written twice, or over one
+            that is read.
     """
+    paths = [os.path.realpath(file) for file in [path, *written]]
+    for file in paths:
+        if paths.count(file) > 1:
+            raise ValueError(f"{file}: named twice, as two files of a {arguments.command_line[1]}")
     with INTERRUPTS.held():  # an interrupt while USD's modules load is caught there, and breaks them
         check_openusd()
         importlib.import_module("warp_bsc.usd.read.find_meshes")
@@ -145,11 +154,15 @@ def read_scene(path: str, arguments: argparse.Namespace, *, as_json: bool = Fals
     how = {"strict": arguments.strict, "allow_missing": arguments.allow_missing}
     try:
         with RunProgress("Comparing vertices", as_json=as_json) as progress:
-            return Scene(path, **how, **options, progress=progress.show)
+            scene = Scene(path, **how, **options, progress=progress.show)
     except (OSError, ValueError):
         raise
     except Exception as error:
         raise ValueError(f"{path}: {describe(error)}") from error
+    for file in written:
+        if file in scene.files:
+            raise ValueError(f"{file}: the scene is read from this file; write to another one")
+    return scene
 
 
 def describe_selection(scene: Scene, arguments: argparse.Namespace) -> dict[str, Any]:
@@ -166,12 +179,10 @@ def command_of(arguments: argparse.Namespace) -> str:
     if not arguments.intersections:
         words.append("--no-intersections")
     words += [_option("ignore_initial")] * arguments.ignore_initial
-    for name, default in (("method", "exact"), ("subdivide", 1), ("validate", 0)):
+    defaults = {"method": "exact", "subdivide": 1, "validate": 0, "clearance": None, "limit": None}
+    for name, default in defaults.items():
         value = getattr(arguments, name)
         words += [_option(name), str(value)] if value != default else []
-    for name in ("clearance", "limit"):
-        value = getattr(arguments, name)
-        words += [_option(name), str(value)] if value is not None else []
     return shlex.join(words + _selection_words(arguments))
 
 
@@ -206,20 +217,12 @@ def _output(text: str) -> str:
 
 def _frames(text: str) -> FrameRange:
     parts = text.split(":")
-    if len(parts) > 3:
+    if not 2 <= len(parts) <= 3:
         raise argparse.ArgumentTypeError(f"must be START:END:STEP, not {text!r}")
     try:
-        numbers = [float(part) if part else None for part in parts]
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"must be START:END:STEP, three numbers, not {text!r}") from None
-    start, end, step = numbers + [None] * (3 - len(numbers))
-    if any(number is not None and not math.isfinite(number) for number in numbers):
-        raise argparse.ArgumentTypeError(f"must be finite numbers, not {text!r}")
-    if step is not None and step <= 0:
-        raise argparse.ArgumentTypeError(f"STEP must be more than 0, not {step:g}")
-    if len(parts) < 2 or (start is not None and end is not None and end < start):
-        raise argparse.ArgumentTypeError(f"must be START:END:STEP with END not before START, not {text!r}")
-    return FrameRange(start, end, step)
+        return FrameRange(*(float(part) if part else None for part in parts))
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"must be START:END:STEP, three numbers, not {text!r}: {error}") from None
 
 
 def _validate(text: str) -> int | Literal["all"]:

@@ -2,7 +2,6 @@
 
 import argparse
 import contextlib
-import errno
 import time
 from collections.abc import Generator
 from typing import Any
@@ -22,7 +21,7 @@ from ..scene_replay.summary import Summary
 from ..scene_replay.threads import WriteBehind
 from ..scene_replay.usd_overlay import SHOWN_BY, Overlay
 from ..usd.scene import Scene
-from .error_boundary import describe
+from .error_boundary import describe, finish_outputs
 from .exit_status import ExitStatus
 from .interrupts import INTERRUPTS, Interrupted
 from .progress import RunProgress
@@ -180,11 +179,19 @@ class ReplayRun(contextlib.ExitStack):
         finished = self._outputs if self._intervals else []  # an earlier file is better than an empty one
         if self._earlier and len(self._intervals) < self._earlier.count:  # or than a shorter one, to resume
             finished = [output for output in finished if not isinstance(output, HitsJson)]
+        files, streams = (
+            {output.file.name: output for output in finished if output.file.is_stream == which}
+            for which in (False, True)
+        )
+
+        def finish(output: ReplayOutput, _shortage: str) -> None:
+            output.finish(summary)
+
         # Signals do not interrupt the files. They do interrupt streams, whose reader may not read to the end.
-        self.problems += finish_outputs([output for output in finished if not output.file.is_stream], summary)
+        self.problems += finish_outputs(files, finish)
         try:
             with INTERRUPTS.raised():
-                self.problems += finish_outputs([output for output in finished if output.file.is_stream], summary)
+                self.problems += finish_outputs(streams, finish)
         except BrokenPipeError:
             if not self.problems:
                 raise
@@ -228,34 +235,3 @@ class ReplayRun(contextlib.ExitStack):
         except ValueError as changed:
             return str(changed)
         return describe(error) if isinstance(error, OSError | ValueError) else f"{self._scene.path}: {describe(error)}"
-
-
-def finish_outputs(outputs: list[ReplayOutput], summary: Summary) -> list[str]:
-    """Finishes files, without their last intervals if the disk is full; returns messages on missing parts.
-
-    On a full disk all files shrink down to half of their intervals. After that only the file that does not fit
-    shrinks, or is omitted; the page comes first, as it matters least.
-    """
-    problems, shortages = [], {}
-    shared = 5  # number of eighths that all files lose, which leave about a half
-    waiting = outputs[::-1]  # the tables, which are the largest, come last
-    while waiting:
-        output = waiting[0]
-        try:
-            output.finish(summary)
-        except Exception as error:
-            if isinstance(error, BrokenPipeError) and str(output.file.path) == STDOUT:
-                raise  # its reader has closed it, which is not an error
-            number = error.errno if isinstance(error, OSError) else None
-            sharing, smaller = [output], []
-            if number in (errno.ENOSPC, errno.EDQUOT) and shared:
-                sharing, shared = waiting, shared - 1
-            if number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-                smaller = [other for other in sharing if other.shrink()]
-            if smaller:
-                shortages |= {other.file.name: describe(error) for other in smaller}
-                continue
-            shortages.pop(output.file.name, None)
-            problems.append(f"{output.file.name}: not written: {describe(error)}")
-        waiting.pop(0)
-    return problems + [f"{name}: not all of it is written: {shortage}" for name, shortage in shortages.items()]

@@ -2,7 +2,7 @@
 
 import functools
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -358,6 +358,14 @@ class CollisionMesh:
             edge = self.edges[mixed[0]]
             raise ValueError(f"world must be one for an edge, but edge {edge.tolist()} has {worlds[edge].tolist()}")
         return worlds.astype(np.int32)
+
+
+def changed_mesh(mesh: CollisionMesh, **changes: Any) -> CollisionMesh:
+    """Returns a mesh with other arguments of the constructor, else with those of one, which has no tetrahedra."""
+    names = "faces", "vertex_count", "points", "radius", "world", "group", "mask", "only_free", "device"
+    own: dict[str, Any] = {name: getattr(mesh, name) for name in names}
+    own["edges"] = mesh.edges[mesh.free_edges]
+    return CollisionMesh(**(own | changes))
 
 
 def leave_out(part: ArrayLike | wp.array, pairs: ArrayLike) -> tuple[np.ndarray, np.ndarray]:

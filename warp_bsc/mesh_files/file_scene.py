@@ -43,12 +43,12 @@ class FileScene(Scene):
             OSError: If a file cannot be read.
             ValueError: If a file is not as its format says, or a name is there twice.
         """
-        self.frames, self.stage = frames, None
+        self.frames, self.stage, self.left_out = frames, None, []
         self.path, self.selection = ", ".join(frames.names), Selection()
         self._lock, self._unreadable = threading.RLock(), ()
         self._collecting = lambda *_: contextlib.nullcontext()
         self._record, self._jumps, self._welds = ReadingRecord(), JumpFinder(), {}
-        self._left_out = SimpleNamespace(reasons=[], notes=[])
+        self._left_out = SimpleNamespace(reasons=self.left_out, notes=[])
         self._segment = self._span = None
         self.files = _Files(frames)
         columns = zip(frames.names, frames.are_several, zip(*frames.paths, strict=True), strict=True)

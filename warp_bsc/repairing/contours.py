@@ -5,6 +5,7 @@ from typing import Literal
 
 import numpy as np
 
+from ..detection.at_rest.body_parts import connect_cells
 from ..detection.mesh import CollisionMesh
 
 ContourKind = Literal["closed", "border", "open"]
@@ -49,7 +50,7 @@ def trace_contours(mesh: CollisionMesh, pairs: np.ndarray) -> Contours:
     turned = (owners[same] != owners[same + 1]).astype(np.int64)  # the edge of the next end is of the other face
     # each intersection is two nodes, one for each sign that it may have
     nodes = [np.stack([2 * one + i, 2 * other + (i ^ turned)], axis=1) for i in (0, 1)]
-    label = connected_components(2 * n, np.concatenate(nodes))
+    label = connect_cells(np.concatenate(nodes), 2 * n)
     plus, minus = label[0::2], label[1::2]
     _, number = np.unique(np.minimum(plus, minus), return_inverse=True)
     number = number.reshape(-1)
@@ -63,21 +64,3 @@ def trace_contours(mesh: CollisionMesh, pairs: np.ndarray) -> Contours:
         for inside, border in zip(ends_inside, ends_at_border, strict=True)
     ]
     return Contours(number, np.sign(minus - plus), kinds)
-
-
-def connected_components(count: int, edges: np.ndarray) -> np.ndarray:
-    """Returns the smallest node that each node of a graph is connected with, int, shape [count].
-
-    Args:
-        count: Number of nodes.
-        edges: Pairs of nodes, int, shape [n, 2].
-    """
-    label = np.arange(count)
-    while len(edges):
-        ends = label[edges]
-        edges = edges[ends[:, 0] != ends[:, 1]]
-        low, high = np.sort(label[edges], axis=1).T
-        np.minimum.at(label, high, low)
-        while (label != label[label]).any():
-            label = label[label]
-    return label

@@ -4,8 +4,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from ..detection.at_rest.body_parts import connect_cells
 from .approach import approach, score_of
-from .contours import connected_components
 from .elastic import Springs, near
 from .motion import Faults, push_apart
 from .sheets import separate_sheets
@@ -122,7 +122,7 @@ def free(
         movable: Vertices that may move, bool, shape [n], beside those near contours and near pairs.
     """
     x, springs = _opened(surface, start, crossings, movable)
-    left = _pieces_that_cross(surface, x, connected_components(len(x), surface.edges))
+    left = _pieces_that_cross(surface, x, connect_cells(surface.edges, len(x)))
     if not len(left):
         return _returned(surface, x, springs, max_strain)
     is_of_two = (left[:, 0] != left[:, 1]).all()  # pieces that an order may free
@@ -140,14 +140,13 @@ def _opened(
     surface: Surface, start: np.ndarray, crossings: np.ndarray, movable: np.ndarray | None
 ) -> tuple[np.ndarray, Springs]:
     """Returns positions at which less crosses, or is near, and springs of what may move; as :func:`free` otherwise."""
-    untangled = untangle(surface, start, crossings)
-    x = push_apart(surface, untangled.x) if surface.keeps_distance else untangled.x
-    (pushed,) = np.nonzero(differ(x, untangled.x))
-    may_move = untangled.springs.movable | near(surface, pushed, _RINGS)
+    untangled, springs = untangle(surface, start, crossings)
+    x = push_apart(surface, untangled) if surface.keeps_distance else untangled
+    (pushed,) = np.nonzero(differ(x, untangled))
+    may_move = springs.movable | near(surface, pushed, _RINGS)
     if movable is not None:
         may_move |= movable
-    is_known = (may_move == untangled.springs.movable).all()
-    return x, untangled.springs if is_known else Springs(surface, may_move)
+    return x, springs if (may_move == springs.movable).all() else Springs(surface, may_move)
 
 
 def _returned(surface: Surface, x: np.ndarray, springs: Springs, max_strain: float, **options) -> np.ndarray:
@@ -174,7 +173,7 @@ def offset(surface: Surface, crossings: np.ndarray) -> np.ndarray:
     # at a crease, normals cancel each other
     normals *= (lengths > _FLATTEST * size)[:, None] / np.maximum(lengths, 1e-30)[:, None]
     moves = near(surface, np.append(surface.mesh.edges[crossings[:, 0]], surface.mesh.faces[crossings[:, 1]]), 1)
-    _, piece = np.unique(connected_components(len(x), surface.edges)[moves], return_inverse=True)
+    _, piece = np.unique(connect_cells(surface.edges, len(x))[moves], return_inverse=True)
     distances = np.zeros((len(x), 1))
     distances[moves, 0] = _OFFSET * surface.edge * (1.0 + piece.reshape(-1)) / (1.0 + piece.max(initial=0))
     for side in (1.0, -1.0):
@@ -195,7 +194,7 @@ def free_by_smoothing(surface: Surface, start: np.ndarray, max_strain: float) ->
         start: Where the search begins, in units, shape [n, 3].
         max_strain: Largest strain that is sought.
     """
-    edges, piece = surface.edges, connected_components(len(start), surface.edges)
+    edges, piece = surface.edges, connect_cells(surface.edges, len(start))
     first, second = _pieces_that_cross(surface, start, piece).T
     crossing = first[first == second]
     if not len(crossing):
@@ -236,7 +235,7 @@ def free_by_order(
         chosen: Sheet of each vertex from inside to outside, -1 for none, int, shape [n]; those that are chosen are
             written.
     """
-    piece, tried = connected_components(len(x), surface.edges), set()
+    piece, tried = connect_cells(surface.edges, len(x)), set()
     while True:
         ends = _pieces_that_cross(surface, x, piece)
         pairs = sorted(set(map(tuple, np.sort(ends[ends[:, 0] != ends[:, 1]], axis=1).tolist())) - tried)
@@ -279,6 +278,6 @@ def _restored(surface: Surface, before: Faults, after: Faults) -> np.ndarray:
         ends, corners = mesh.edges[pairs[:, 0]], mesh.faces[pairs[:, 1]]
         links += [np.stack([ends[:, i], other], axis=1) for i in (0, 1) for other in corners.T]
         faults.append(np.append(ends[:, 0], found.inside))
-    part = connected_components(len(after.x), np.concatenate(links))
+    part = connect_cells(np.concatenate(links), len(after.x))
     counts = [np.bincount(part[vertices], minlength=len(part)) for vertices in faults]
     return np.where((2 * counts[1] > counts[0])[part][:, None], surface.home, after.x)

@@ -8,12 +8,11 @@ import warp as wp
 
 from .._arguments import check_finite
 from ..detection.at_rest.body_parts import connect_cells
-from ..detection.mesh import CollisionMesh
+from ..detection.mesh import CollisionMesh, changed_mesh
 from ..detection.run.launch import launch
 from ..response.report.inside import Inside, InsideFinder
 from ..response.state.mesh import ModelMesh, Placement, elements_of
 from ..response.state.motion import plane_in
-from .contours import connected_components
 from .solids import leave_solid, leave_solid_whole, spread_exits
 from .surface import Surface, differ, weld_borders
 
@@ -96,7 +95,7 @@ class ModelSurface(Surface):
             Positions in units, and which vertices may have moved, bool, shape [n].
         """
         movable, corners = np.zeros(len(x), dtype=bool), self.given.faces[:, 0]
-        body = connected_components(len(x), self.edges)
+        body = connect_cells(self.edges, len(x))
         is_held = np.isin(body, body[self.fixed])
         for _ in range(_ESCAPES):
             inside = self.particles_inside(x)
@@ -168,12 +167,6 @@ def _with_planes(
             worlds.append(np.full(4, w))
             count += 4
     world = np.concatenate(worlds)
-    whole = CollisionMesh(
-        np.concatenate(faces),
-        count,
-        edges=mesh.edges[mesh.free_edges],
-        points=mesh.points,
-        world=None if mesh.world is None else world,
-        device=mesh.device,
-    )
+    of_mesh = None if mesh.world is None else world
+    whole = changed_mesh(mesh, faces=np.concatenate(faces), vertex_count=count, world=of_mesh)
     return whole, np.concatenate(positions), np.concatenate(shapes), world

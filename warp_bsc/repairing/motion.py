@@ -112,7 +112,7 @@ def push_apart(surface: Surface, x: np.ndarray) -> np.ndarray:
 def pushed(surface: Surface, x: np.ndarray, contacts: Contacts) -> np.ndarray:
     """Returns positions at which contacts have their gaps, nearly; rigid groups follow their vertices in contact."""
     moved = projected(surface.fixed, x, contacts, device=surface.device)
-    return surface.carried(moved, differ(moved, x))
+    return surface.rigid.carried(moved, surface.home, differ(moved, x))
 
 
 def near_pairs(surface: Surface, x: np.ndarray) -> np.ndarray:

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from ..detection.at_rest.body_parts import connect_cells
 from .closest import closest_points
-from .contours import connected_components
 from .elastic import Springs, near
 from .surface import Surface
 
@@ -69,7 +69,7 @@ def _put_on_side(surface: Surface, x: np.ndarray, moving: np.ndarray, obstacle: 
     behind = np.zeros(len(x), dtype=bool)
     behind[vertices] = side * np.einsum("ij,ij->i", way, normals) > _ALONG_NORMAL * np.linalg.norm(way, axis=1)
     # of these, the parts that contours bound
-    part = connected_components(len(x), mesh.edges[behind[mesh.edges].all(axis=1)])
+    part = connect_cells(mesh.edges[behind[mesh.edges].all(axis=1)], len(x))
     a, b, c = (x[corners[cuts, i]] for i in range(3))
     heights = np.einsum("ikj,ij->ik", x[ends[cuts]] - a[:, None], np.cross(b - a, c - a))
     wrong = behind & np.isin(part, part[ends[cuts][side * heights < 0.0]])

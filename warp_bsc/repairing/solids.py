@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from ..detection.at_rest.body_parts import connect_cells
 from .closest import closest_points, exit_distances
-from .contours import connected_components
 from .elastic import Springs, near
 from .surface import Surface
 
@@ -33,7 +33,7 @@ def leave_solid(surface: Surface, x: np.ndarray, faces: np.ndarray, vertices: np
     moves = ways + _GAP * surface.edge * normals
     is_inside = np.zeros(len(x), dtype=bool)
     is_inside[vertices] = True
-    part = connected_components(len(x), surface.edges[is_inside[surface.edges].all(axis=1)])[vertices]
+    part = connect_cells(surface.edges[is_inside[surface.edges].all(axis=1)], len(x))[vertices]
     for number in np.unique(part):
         (rows,) = np.nonzero(part == number)
         direction, exits = _common_way(surface, x, faces, vertices[rows], ways[rows])

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 import warp as wp
 
+from ..detection.at_rest.body_parts import connect_cells
 from ..detection.detector import CollisionDetector
-from ..detection.mesh import CollisionMesh
-from .contours import connected_components
+from ..detection.mesh import CollisionMesh, changed_mesh
 from .rigid import RigidGroups
 
 _WRECKED = 0.25
@@ -41,7 +41,7 @@ def weld_borders(mesh: CollisionMesh, positions: np.ndarray, *labels: np.ndarray
         marks = [values[vertices] for values in (*labels, *bits)]
         places = positions[vertices]
         if tolerance:
-            places = connected_components(len(vertices), _pairs_within(places, marks, tolerance))
+            places = connect_cells(_pairs_within(places, marks, tolerance), len(vertices))
         keys = np.column_stack([places, *marks])
         _, firsts, numbers = np.unique(keys, axis=0, return_index=True, return_inverse=True)
         weld[vertices] = vertices[firsts[numbers.reshape(-1)]]
@@ -75,17 +75,9 @@ def welded(mesh: CollisionMesh, weld: np.ndarray, radius: np.ndarray | None = No
     if mesh.radius is radius and not mesh.only_free and (weld == np.arange(len(weld))).all():
         return mesh
     edges = weld[mesh.edges[mesh.free_edges]]
-    return CollisionMesh(
-        weld[mesh.faces],
-        mesh.vertex_count,
-        edges=edges[edges[:, 0] != edges[:, 1]],
-        points=weld[mesh.points],
-        radius=radius,
-        world=mesh.world,
-        group=mesh.group,
-        mask=mesh.mask,
-        device=mesh.device,
-    )
+    edges = edges[edges[:, 0] != edges[:, 1]]
+    changes = {"faces": weld[mesh.faces], "edges": edges, "points": weld[mesh.points]}
+    return changed_mesh(mesh, **changes, radius=radius, only_free=False)
 
 
 def differ(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -104,6 +96,7 @@ class Surface:
         given: The mesh as it was given.
         weld: The vertex that each of its vertices is welded to, int, shape [n].
         mesh: The mesh, in which no face uses a doubled vertex.
+        device: Its Warp device.
         edges: Vertices of the edges of the mesh, of the other edges of tetrahedra, and of links of rigid groups, int,
             shape [m, 2].
         ends: The first and the second vertices of the edges, shape [2, m].
@@ -147,7 +140,7 @@ class Surface:
             rigid: Group of each vertex that moves as a whole, -1 for none, int, shape [n]; default: none.
         """
         self.weld = weld = np.arange(len(x)) if weld is None else weld
-        self.given, self.mesh, self._input = mesh, welded(mesh, weld), x
+        self.given, self.mesh, self._input, self.device = mesh, welded(mesh, weld), x, mesh.device
         self.tetrahedra = weld[tetrahedra]
         mesh, self.edges = self.mesh, self.mesh.edges
         is_used = np.zeros(len(x), dtype=bool)
@@ -258,10 +251,6 @@ class Surface:
         """Returns the vertices that are not as in the input, or in a group with one that is not, bool, shape [n]."""
         return ~self.rigid.least(~differ(x, self.home))
 
-    def carried(self, x: np.ndarray, pushed: np.ndarray) -> np.ndarray:
-        """Returns positions at which rigid groups follow those of their vertices that are pushed, bool, shape [n]."""
-        return self.rigid.carried(x, self.home, pushed)
-
     def rounded(self, x: np.ndarray) -> np.ndarray:
         """Returns positions in units as they will be returned: rigid groups as a whole, of the type of the input."""
         rounded, dtype = self.home.copy(), self._input.dtype
@@ -304,11 +293,6 @@ class Surface:
         labels = label[vertices]
         return np.asarray((labels == labels[:, :1]).all(axis=1) & (labels[:, 0] >= 0))
 
-    @property
-    def device(self) -> wp.Device:
-        """The Warp device."""
-        return self.mesh.device
-
     def array(self, values: np.ndarray, dtype: type = wp.vec3d) -> wp.array:
         """Returns an array on the device."""
         return wp.array(values, dtype=dtype, device=self.device)
@@ -338,7 +322,7 @@ def _joined_groups(rigid: np.ndarray, weld: np.ndarray) -> np.ndarray:
     (members,) = np.nonzero(rigid >= 0)
     _, first, group = np.unique(rigid[members], return_index=True, return_inverse=True)
     links = weld[np.stack([members[first][group.reshape(-1)], members], axis=1)]
-    return np.where(np.isin(np.arange(len(rigid)), links), connected_components(len(rigid), links), -1)
+    return np.where(np.isin(np.arange(len(rigid)), links), connect_cells(links, len(rigid)), -1)
 
 
 def _with_edges_of(tetrahedra: np.ndarray, edges: np.ndarray, count: int) -> np.ndarray:

@@ -4,7 +4,7 @@ from fractions import Fraction
 
 import numpy as np
 
-from .contours import connected_components
+from ..detection.at_rest.body_parts import connect_cells
 from .elastic import Springs
 from .surface import Surface, differ
 
@@ -57,6 +57,6 @@ def follow_surface(surface: Surface, x: np.ndarray) -> np.ndarray:
     if not inverted.any():
         return x
     moved = differ(x, surface.home)
-    part = connected_components(len(x), surface.edges[moved[surface.edges].all(axis=1)])
+    part = connect_cells(surface.edges[moved[surface.edges].all(axis=1)], len(x))
     restored = np.isin(part, part[tetrahedra[inverted]]) & moved
     return np.where(restored[:, None], surface.home, x)

@@ -7,8 +7,6 @@ References:
     Minimization." ACM Transactions on Graphics 25, 3 (2006). https://doi.org/10.1145/1141911.1142007.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 import warp as wp
 
@@ -34,23 +32,8 @@ _PATIENCE = 40
 """Iterations without fewer crossings after which the search ends."""
 
 
-@dataclass(frozen=True, eq=False)
-class Untangled:
-    """The best positions of a search.
-
-    Attributes:
-        x: Positions, in units of the surface, float64, shape [n, 3].
-        crossings: What still crosses there, (edge, face), int32, shape [m, 2].
-        springs: Springs of the vertices that the search could move.
-    """
-
-    x: np.ndarray
-    crossings: np.ndarray
-    springs: Springs
-
-
-def untangle(surface: Surface, x: np.ndarray, crossings: np.ndarray) -> Untangled:
-    """Returns positions with the fewest crossings that are found from a start.
+def untangle(surface: Surface, x: np.ndarray, crossings: np.ndarray) -> tuple[np.ndarray, Springs]:
+    """Returns positions with the fewest crossings that are found from a start, and springs of what could move.
 
     In turn, each edge leaves its face along its own gradient of the contour's length, and all edges of a contour along
     their mean. The moves spread over the surface, and springs restore its lengths and angles. What remains are mostly
@@ -63,7 +46,7 @@ def untangle(surface: Surface, x: np.ndarray, crossings: np.ndarray) -> Untangle
     """
     inner = np.zeros(len(x), dtype=bool)
     springs = Springs(surface, inner)
-    best, since, iteration = Untangled(x, crossings, springs), 0, 0
+    best, fewest, since, iteration = (x, springs), len(crossings), 0, 0
     while not surface.are_fixed(crossings).all() and since < _PATIENCE and not surface.is_late:
         vertices = np.hstack([surface.mesh.edges[crossings[:, 0]], surface.mesh.faces[crossings[:, 1]]]).ravel()
         if not inner[vertices].all():
@@ -77,8 +60,8 @@ def untangle(surface: Surface, x: np.ndarray, crossings: np.ndarray) -> Untangle
         x = surface.rounded(x)
         crossings = surface.crossings(x)
         iteration, since = iteration + 1, since + 1
-        if len(crossings) < len(best.crossings):
-            best, since = Untangled(x, crossings, springs), 0
+        if len(crossings) < fewest:
+            best, fewest, since = (x, springs), len(crossings), 0
     return best
 
 
@@ -121,7 +104,7 @@ def _contour_moves(
     moves[involved] = total / np.maximum(weight, 0.5)[:, None]
     given[involved] = ~surface.fixed[involved]
     bound = surface.rigid.vertices
-    moves[bound] = (surface.carried(x + moves, given) - x)[bound]
+    moves[bound] = (surface.rigid.carried(x + moves, surface.home, given) - x)[bound]
     given[bound] = moves[bound].any(axis=1)
     return moves, given
 

@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import orjson
 
 from .._atomic_file import naming
-from .earlier import describe_difference
+from .earlier import find_difference
 from .hit_records import is_tail_line, read_head, read_tail
 from .summary import Summary
 
@@ -94,10 +94,8 @@ class Baseline:
             first = " with ".join(min(no_more_ignored))
             raise ValueError(f"{path}: its replay ignored pairs that this one does not; cannot compare: {first}")
         now = json.loads(json.dumps({"method": method, **options}))
-        for name in now:
-            if name not in _WITHOUT_EFFECT and earlier.get(name) != now[name]:
-                difference = describe_difference(name, earlier, now)
-                raise ValueError(f"{path}: written with other options; cannot compare: {difference}")
+        if difference := find_difference(earlier, now, _WITHOUT_EFFECT):
+            raise ValueError(f"{path}: written with other options; cannot compare: {difference}")
 
     def new_in(self, summary: Summary) -> list[NewFinding]:
         """Returns what meshes do in a replay and did not do in the earlier one at that time."""

@@ -160,12 +160,14 @@ class _SegmentDetector:
 
     Attributes:
         mesh: The segment's meshes.
+        device: Name of the Warp device.
         strands: Detects the collisions of its curves and points; None without any.
     """
 
     def __init__(self, segment: Segment, checks: Checks):
         self._is_validated = checks.validate != 0
         self.mesh = CollisionMesh(segment.faces, segment.vertex_count, device=checks.device)
+        self.device = self.mesh.device.alias
         self._detector = CollisionDetector(self.mesh, method=checks.method)
         self.strands = _StrandChecker(segment, checks) if segment.has_strands else None
         self._finder = self._detector.intersection_finder() if checks.intersections else None
@@ -177,11 +179,6 @@ class _SegmentDetector:
         clearance = checks.clearance
         self._proximity_finder = None if clearance is None else ProximityFinder(self.mesh, clearance)
         self._proximities: _At[Proximities] | None = None
-
-    @property
-    def device(self) -> str:
-        """Name of the Warp device."""
-        return self.mesh.device.alias
 
     def detect(self, interval: Interval) -> _Detection:
         """Returns the detected collisions, intersections and proximities of an interval."""

@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from typing import Any
 
 from .._atomic_file import unfinished_path
@@ -59,11 +59,9 @@ class EarlierReplay:
             raise ValueError(f"{path}: not a resumable replay of this version") from None
         own_facts = json.loads(json.dumps(facts))
         self._names = own_facts["meshes"]
-        for fact in own_facts:
-            if fact != "device" and earlier_facts.get(fact) != own_facts[fact]:
-                self._file.close()
-                difference = describe_difference(fact, earlier_facts, own_facts)
-                raise ValueError(f"{path}: written with other options or files; cannot resume: {difference}")
+        if difference := find_difference(earlier_facts, own_facts, {"device"}):
+            self._file.close()
+            raise ValueError(f"{path}: written with other options or files; cannot resume: {difference}")
         start = self._file.tell()
         self.count = sum(map(is_interval_line, self._file))
         self._file.seek(start)
@@ -107,8 +105,11 @@ class EarlierReplay:
             yield fields
 
 
-def describe_difference(fact: str, earlier: dict[str, Any], now: dict[str, Any]) -> str:
-    """Returns in words how a fact of two replays differs, given the facts of both."""
+def find_difference(earlier: dict[str, Any], now: dict[str, Any], without: Collection[str] = ()) -> str:
+    """Returns in words the first fact that two runs differ in, but for some facts; empty if they are the same."""
+    fact = next((fact for fact in now if fact not in without and earlier.get(fact) != now[fact]), None)
+    if fact is None:
+        return ""
     before, after = earlier.get(fact), now[fact]
     if isinstance(before, dict) and isinstance(after, dict):
         name = next(name for name in after if before.get(name) != after[name])

@@ -9,7 +9,6 @@ from typing import Any, cast
 
 import numpy as np
 
-from .._atomic_file import OutputFile
 from ..usd.segment import Segment
 from .limit import not_listed
 from .outputs import ReplayOutput, without_last_eighth
@@ -102,7 +101,7 @@ class HitsNpz(ReplayOutput):
         names, prims = ([names[side] for names in self._meshes] for side in range(2))
         words = {"meshes": names, "prims": prims, "kinds": KINDS, "phases": _PHASES, "elements": ELEMENT_WORDS}
         starts, ends = np.array(self._times[:count], dtype=float).reshape(-1, 2).T
-        with zipfile.ZipFile(cast(Any, _Writer(self.file)), "w", zipfile.ZIP_DEFLATED) as archive:
+        with zipfile.ZipFile(cast(Any, self.file), "w", zipfile.ZIP_DEFLATED) as archive:
             values = {"facts": json.dumps(facts), "starts": starts, "ends": ends} | words
             for name, value in values.items():
                 with archive.open(f"{name}.npy", "w") as member:
@@ -160,17 +159,3 @@ class HitsNpz(ReplayOutput):
             part = segment.meshes[mesh]
             number[mesh] = self._meshes.setdefault((part.name, part.path), len(self._meshes))
         return number[meshes]
-
-
-class _Writer:
-    """The file as a stream for an archive, which is written from its start to its end."""
-
-    def __init__(self, file: OutputFile):
-        self._file = file
-
-    def write(self, data) -> int:
-        self._file.write(bytes(data))
-        return len(data)
-
-    def flush(self) -> None:
-        pass

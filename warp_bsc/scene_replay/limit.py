@@ -5,7 +5,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from .results import IntervalResult
+from .results import IntervalResult, at_both
 from .scene_contacts import SceneContacts
 from .scene_intersections import SceneIntersections
 from .scene_proximities import SceneProximities
@@ -26,15 +26,12 @@ def limit_rows(result: IntervalResult, limit: int) -> IntervalResult:
         result: The result.
         limit: The limit, at least 1.
     """
-    contacts = _first(result.contacts, result.contacts.toi, limit)
-    intersections = proximities = None
-    if result.intersections:
-        start, end = (_limit_intersections(found, limit) for found in result.intersections)
-        intersections = start, end
-    if result.proximities:
-        start, end = (_first(found, found.distance, limit) for found in result.proximities)
-        proximities = start, end
-    return replace(result, contacts=contacts, intersections=intersections, proximities=proximities)
+    return replace(
+        result,
+        contacts=_first(result.contacts, result.contacts.toi, limit),
+        intersections=at_both(lambda found: _limit_intersections(found, limit), result.intersections),
+        proximities=at_both(lambda found: _first(found, found.distance, limit), result.proximities),
+    )
 
 
 @dataclass(frozen=True)

@@ -274,19 +274,18 @@ def _pairs_of_meshes(summary: Summary, new: Iterable[NewFinding]) -> list[dict]:
     new_of: dict[tuple[str, str], list[tuple[str, float, float]]] = {}
     for what, meshes, start, end in new:
         new_of.setdefault((min(meshes), max(meshes)), []).append((what, start, end))
-    return [_pair(pair, new_of.get(pair.meshes, [])) for pair in pairs_of_meshes(summary)[:MAX_PAIRS]]
-
-
-def _pair(pair: PairFindings, new: list) -> dict:
-    lists = {
-        "spans": [(span.since, span.until, span.hits) for span in pair.collisions],
-        "rest": [
-            (span.since, span.until, span.most, span.trend, span.meshes[0] if span.inside else "")
-            for span in pair.intersections
-        ],
-        "near": [(span.since, span.until, span.distance) for span in pair.proximities],
-        "new": new,
-    }
-    more = {f"more_{name}": max(0, len(found) - _MAX_ROWS) for name, found in lists.items()}
-    facts = {"meshes": pair.meshes, "hits": pair.hits, "depth": pair.depth, "is_initial": pair.is_initial}
-    return facts | {name: found[:_MAX_ROWS] for name, found in lists.items()} | more
+    rows = []
+    for pair in pairs_of_meshes(summary)[:MAX_PAIRS]:
+        lists = {
+            "spans": [(span.since, span.until, span.hits) for span in pair.collisions],
+            "rest": [
+                (span.since, span.until, span.most, span.trend, span.meshes[0] if span.inside else "")
+                for span in pair.intersections
+            ],
+            "near": [(span.since, span.until, span.distance) for span in pair.proximities],
+            "new": new_of.get(pair.meshes, []),
+        }
+        facts = {"meshes": pair.meshes, "hits": pair.hits, "depth": pair.depth, "is_initial": pair.is_initial}
+        more = {f"more_{name}": max(0, len(found) - _MAX_ROWS) for name, found in lists.items()}
+        rows.append(facts | {name: found[:_MAX_ROWS] for name, found in lists.items()} | more)
+    return rows

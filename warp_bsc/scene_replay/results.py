@@ -1,7 +1,9 @@
 """The result of a replay in one interval, in full and in numbers."""
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -25,6 +27,8 @@ TOI_BINS = 20
 
 AnyPairs = SceneContacts | SceneIntersections | SceneProximities
 """Pairs of an interval, or of a time."""
+
+_Found, _Made = TypeVar("_Found"), TypeVar("_Made")
 
 
 @dataclass(frozen=True)
@@ -271,6 +275,11 @@ class IntervalResult:
         return [self.contacts, *(self.intersections or ())[:times], *(self.proximities or ())[:times]]
 
 
+def at_both(make: Callable[[_Found], _Made], found: tuple[_Found, _Found] | None) -> tuple[_Made, _Made] | None:
+    """Returns what a function makes of findings at the start and at the end of an interval; None without findings."""
+    return (make(found[0]), make(found[1])) if found else None
+
+
 def summarize(
     contacts: SceneContacts,
     intersections: tuple[SceneIntersections, SceneIntersections] | None,
@@ -294,14 +303,6 @@ def summarize(
             float(contacts.time[first]),
             tuple(contacts.position[first].tolist()),
         )
-    at_rest = None
-    if intersections:
-        start, end = map(summarize_intersections, intersections)
-        at_rest = start, end
-    proximity_summaries = None
-    if proximities:
-        start, end = map(_summarize_proximities, proximities)
-        proximity_summaries = start, end
     phases = None
     if contacts.phase is not None:
         phases = tuple(np.bincount(contacts.phase[contacts.phase >= 0], minlength=len(PHASES)).tolist())
@@ -321,11 +322,11 @@ def summarize(
         certified=certified,
         stats=stats,
         validation=validation,
-        intersections=at_rest,
+        intersections=at_both(summarize_intersections, intersections),
         ignored=contacts.ignored,
         separate_hits=None if contacts.separate is None else int(contacts.separate.sum()),
         phases=phases,
-        proximities=proximity_summaries,
+        proximities=at_both(_summarize_proximities, proximities),
         duplicates=duplicates,
         inverted=inverted,
     )

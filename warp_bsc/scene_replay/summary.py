@@ -11,7 +11,7 @@ from ..usd.scene import Scene
 from .results import TOI_BINS, IgnoredPair, IntersectionSummary, IntervalSummary, Nearest, ProximitySummary
 from .validation import Validation
 
-_Span = TypeVar("_Span")
+_Span = TypeVar("_Span", bound="Span")
 _AtRest = TypeVar("_AtRest", IntersectionSummary, ProximitySummary)
 
 CERTIFIED_FOR = "vertices that move straight or turn about one axis between the times checked"
@@ -19,30 +19,42 @@ CERTIFIED_FOR = "vertices that move straight or turn about one axis between the 
 
 
 @dataclass(frozen=True)
-class CollisionSpan:
-    """Consecutive intervals of a scene in all of which two meshes collide, or a mesh collides with itself.
+class Span:
+    """Consecutive intervals, or times, of a scene at all of which meshes do something.
 
     Attributes:
-        meshes: Names of the two.
-        since: Start of the first interval, as a time code.
-        until: End of the last interval.
+        meshes: Their names.
+        since: Start of the first interval, or the first of the times, as a time code.
+        until: End of the last interval, or the last of the times.
+    """
+
+    meshes: tuple[str, ...]
+    since: float
+    until: float
+
+    @property
+    def when(self) -> str:
+        """The times, in words."""
+        return f"at {self.since:g}" if self.since == self.until else f"from {self.since:g} to {self.until:g}"
+
+
+@dataclass(frozen=True)
+class CollisionSpan(Span):
+    """Intervals in which two meshes collide, or a mesh collides with itself.
+
+    Attributes:
         hits: Number of their pairs that collide.
     """
 
     meshes: tuple[str, str]
-    since: float
-    until: float
     hits: int
 
 
 @dataclass(frozen=True)
-class IntersectionSpan:
-    """Consecutive times at all of which two meshes intersect, a mesh intersects itself, or one is inside another.
+class IntersectionSpan(Span):
+    """Times at which two meshes intersect, a mesh intersects itself, or one is inside another, which comes second.
 
     Attributes:
-        meshes: Names of the two; the one that is inside first.
-        since: The first of the times, as a time code.
-        until: The last of the times.
         is_open: Whether the last time is the last that was checked, so that the intersection may continue.
         inside: Whether parts of the first mesh are wholly inside the second; otherwise edges of one meet faces of the
             other.
@@ -55,8 +67,6 @@ class IntersectionSpan:
     """
 
     meshes: tuple[str, str]
-    since: float
-    until: float
     is_open: bool
     inside: bool
     becomes: str
@@ -78,62 +88,40 @@ class IntersectionSpan:
 
 
 @dataclass(frozen=True)
-class ProximitySpan:
-    """Consecutive times of a scene at all of which two meshes are near each other, or a mesh is near itself.
+class ProximitySpan(Span):
+    """Times at which two meshes, by their sorted names, are near each other, or a mesh is near itself.
 
     Attributes:
-        meshes: Names of the two, sorted.
-        since: The first of the times, as a time code.
-        until: The last of the times.
         distance: Their smallest distance at these times, in the scene's unit of length.
         nearest_at: The first time with that distance.
     """
 
     meshes: tuple[str, str]
-    since: float
-    until: float
     distance: float
     nearest_at: float
 
 
 @dataclass(frozen=True)
-class DuplicateSpan:
-    """Consecutive intervals of a scene in all of which meshes are duplicates of each other.
-
-    Attributes:
-        meshes: Their names, in the scene's order.
-        since: Start of the first interval, as a time code.
-        until: End of the last interval.
-    """
-
-    meshes: tuple[str, ...]
-    since: float
-    until: float
+class DuplicateSpan(Span):
+    """Intervals in which meshes, in the scene's order, are duplicates of each other."""
 
     def describe(self, most: int) -> str:
         """Returns the duplicates in words, with at most some of their names."""
         names, more = ", ".join(self.meshes[:most]), len(self.meshes) - most
-        when = _when(self)
         others = f" and {more:,} more" if more > 0 else ""
-        return f"{len(self.meshes):,} meshes are duplicates of each other, {when}: {names}{others}"
+        return f"{len(self.meshes):,} meshes are duplicates of each other, {self.when}: {names}{others}"
 
 
 @dataclass(frozen=True)
-class InversionSpan:
-    """Consecutive intervals of a scene in all of which tetrahedra of a mesh invert or are inverted.
+class InversionSpan(Span):
+    """Intervals in which tetrahedra of a mesh invert or are inverted.
 
     Attributes:
-        meshes: Name of the mesh.
-        since: Start of the first interval, as a time code.
-        until: End of the last interval.
         most: Largest number of these tetrahedra in an interval.
         tetrahedron: The first, an index in ``tetVertexIndices``.
         time: Time code at which it inverts, or is inverted.
     """
 
-    meshes: tuple[str]
-    since: float
-    until: float
     most: int
     tetrahedron: int
     time: float
@@ -142,7 +130,7 @@ class InversionSpan:
         """Returns the inversions in words."""
         number = "1 tetrahedron is" if self.most == 1 else f"at most {self.most:,} tetrahedra are"
         first = f"the first is tetrahedron {self.tetrahedron}, at {self.time:.6g}"
-        return f"{number} inverted in {self.meshes[0]}, {_when(self)}; {first}"
+        return f"{number} inverted in {self.meshes[0]}, {self.when}; {first}"
 
 
 @dataclass(frozen=True)
@@ -218,10 +206,8 @@ class Summary:
             {meshes: CollisionSpan(meshes, at.start, at.end, hits) for meshes, hits in at.mesh_pairs.items()}
             for at in self.intervals
         )
-        return sorted(
-            _joined(begun, lambda a, b: replace(a, until=b.until, hits=a.hits + b.hits)),
-            key=lambda span: (span.since, -span.hits),
-        )
+        joined = _joined(begun, lambda a, b: replace(a, until=b.until, hits=a.hits + b.hits))
+        return sorted(joined, key=lambda span: (span.since, -span.hits))
 
     @cached_property
     def intersections(self) -> list[IntersectionSummary]:
@@ -269,10 +255,8 @@ class Summary:
             }
             for at in self.proximities
         )
-        return sorted(
-            _joined(begun, lambda a, b: replace(b if b.distance < a.distance else a, since=a.since, until=b.until)),
-            key=lambda span: (span.since, span.distance),
-        )
+        near = _joined(begun, lambda a, b: replace(b if b.distance < a.distance else a, since=a.since, until=b.until))
+        return sorted(near, key=lambda span: (span.since, span.distance))
 
     @cached_property
     def duplicate_spans(self) -> list[DuplicateSpan]:
@@ -387,11 +371,6 @@ def _at_all_times(intervals: Iterable[tuple[_AtRest, _AtRest] | None]) -> list[_
 
 def _count(number: int, one: str) -> str:
     return f"{number:,} {one}{'s' * (number != 1)}"
-
-
-def _when(span: DuplicateSpan | InversionSpan) -> str:
-    """Returns the times of a span in words."""
-    return f"at {span.since:g}" if span.since == span.until else f"from {span.since:g} to {span.until:g}"
 
 
 def _joined(times: Iterable[dict[tuple[str, ...], _Span]], join: Callable[[_Span, _Span], _Span]) -> list[_Span]:

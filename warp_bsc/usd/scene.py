@@ -90,6 +90,7 @@ class Scene:
         face_count: Number of triangles of the first segment.
         turning: Number of meshes that transforms or skeletons move, which is not straight between samples.
         has_strands: Whether it has curves or points that are checked at some time.
+        left_out: The parts that were left out so far because they could not be read, and the reasons, a sentence each.
     """
 
     times: list[float]
@@ -166,6 +167,7 @@ class Scene:
         self.selection = options.selection or Selection()
         self._unreadable = UnreadableError
         self._left_out = LeftOut(path, options.strict, options.allow_missing)
+        self.left_out = self._left_out.reasons
         self._is_given, self._written = stage is not None, None
         self.stage = open_stage(path, self._left_out) if stage is None else stage  # prims expire with their stage
         if stage is not None:
@@ -199,7 +201,7 @@ class Scene:
             self._jumps = JumpFinder()
             self._welds = {}  # by span
             for part in revealed.left_out:
-                self._left_out.reasons.append(part.reason)
+                self.left_out.append(part.reason)
                 self._apply(part)
             self._welds.update(revealed.welds)
             segment = self.segment(0, progress)
@@ -210,11 +212,6 @@ class Scene:
         self.display_names = {mesh.name: mesh.display_name for mesh in read}
         self.has_strands = any(mesh.is_strands for mesh in read)
         self.turning = sum(mesh.turns for mesh in read)
-
-    @property
-    def left_out(self) -> list[str]:
-        """The parts that were left out so far because they could not be read, and the reasons, a sentence each."""
-        return self._left_out.reasons
 
     @property
     def warnings(self) -> list[str]:
@@ -336,7 +333,7 @@ class Scene:
             notes: The notes. Those of all previous intervals must have been recorded.
         """
         for part in notes.left_out:
-            self._left_out.reasons.append(part.reason)
+            self.left_out.append(part.reason)
             self._apply(part)
         messages = self._record.messages
         messages += [message for message in notes.messages if message not in messages]

@@ -32,6 +32,8 @@ class Segment:
         vertex_count: Number of vertices of all meshes, welded.
         welded: Number of vertices that were welded to another one.
         dtype: Type of the positions, float32 or float64.
+        start_positions: Positions of all vertices in world space at the first time, shape [vertex_count, 3]; not to be
+            written to.
     """
 
     meshes: list[SceneMesh]
@@ -106,9 +108,9 @@ class Segment:
         curve_of_vertex, radii = (np.concatenate([[], *arrays]) for arrays in (curves, radius))
         alone = np.concatenate([np.zeros(0, dtype=np.int64), *points_alone])
 
-        self._start = np.zeros((vertex_count, 3), dtype)
+        self.start_positions = np.zeros((vertex_count, 3), dtype)
         everything = np.arange(vertex_count)
-        self._reader(everything, range(len(self.meshes))).read(self._start, times[0], False)
+        self._reader(everything, range(len(self.meshes))).read(self.start_positions, times[0], False)
         if welds is None:
             self._welded_to = self._find_welds(times, progress)
         else:
@@ -125,17 +127,12 @@ class Segment:
             np.maximum.at(self.radius, np.searchsorted(self._kept, self._welded_to), radii)
             self.radius[self.faces] = 0.0  # curves welded to a mesh would thicken its faces
         self.welded = vertex_count - self.vertex_count
-        self._start = self._start[self._kept]
+        self.start_positions = self.start_positions[self._kept]
         self._along, self._length = self._measure_curves()
         moving = [number for number, mesh in enumerate(self.meshes) if mesh.moves]
         jumping = [number for number in moving if usd_meshes[number].may_jump]
         self._moving = self._reader(self._kept, moving)
         self._jumping = self._reader(self._kept, jumping) if jumping else None
-
-    @property
-    def start_positions(self) -> np.ndarray:
-        """Positions of all vertices in world space at the first time, shape [vertex_count, 3]; not to be written to."""
-        return self._start
 
     def positions(self, time: float, *, before: bool = False, last: np.ndarray | None = None) -> np.ndarray:
         """Returns the positions of all vertices in world space.
@@ -156,7 +153,7 @@ class Segment:
             return last
         reader = self._moving if last is None else self._jumping
         assert reader
-        positions = (self._start if last is None else last).copy()
+        positions = (self.start_positions if last is None else last).copy()
         reader.read(positions, time, before)
         return positions
 
@@ -385,7 +382,7 @@ class Segment:
             The distance of each vertex from the start along its curve, NaN without a curve, and the length of its curve
             if that is closed, else infinity; each of shape [vertex_count].
         """
-        ends, x = self._unwelded_edges, self._start.astype(np.float64)
+        ends, x = self._unwelded_edges, self.start_positions.astype(np.float64)
         lengths = np.linalg.norm(x[self.free_edges[:, 1]] - x[self.free_edges[:, 0]], axis=1)
         is_next = ends[:, 1] == ends[:, 0] + 1  # other edges close a curve
         steps = np.zeros(len(self._welded_to))
@@ -414,7 +411,7 @@ class Segment:
 
     def _find_welds(self, times, progress) -> np.ndarray:
         """Returns for each vertex the first one that has the same position at every time, shape [vertex_count]."""
-        welded_to = first_by_position(first_by_hash(self._start), self._start)
+        welded_to = first_by_position(first_by_hash(self.start_positions), self.start_positions)
         (crowded,) = np.nonzero(np.bincount(welded_to, minlength=len(welded_to))[welded_to] > 1)
         owners = distinct(self._points.meshes(crowded)).tolist()
         moving = [number for number in owners if self.meshes[number].moves]
@@ -425,7 +422,7 @@ class Segment:
         if times[-1] > times[-2]:
             moments.append((times[-1], True))
         reader = self._reader(crowded, moving)
-        positions = self._start[crowded]
+        positions = self.start_positions[crowded]
         firsts = np.searchsorted(crowded, welded_to[crowded])
         for done, (time, before) in enumerate(moments):
             if progress:

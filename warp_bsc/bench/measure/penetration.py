@@ -5,7 +5,7 @@ The scenes are in :mod:`..scenes.penetration`, which is imported with Newton whe
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -37,85 +37,77 @@ class Simulator:
 
     Attributes:
         title: Its name for people.
-        package: The distribution that it comes with.
         rate: Steps a second.
         settings: Its settings, and where they come from.
         claims: What it says of penetration; None if nothing.
+        package: The distribution that it comes with.
         solver: One of :data:`.response.SOLVERS`, or ``"implicit"``; None for one that is not for Newton.
         has_self_contact: Whether VBD has contacts between particles of its own.
         has_stage: Whether :class:`warp_bsc.SolverCCD` is behind the solver, or the solver is one itself.
     """
 
     title: str
-    package: str
     rate: int
     settings: str
     claims: str | None = None
+    package: str = "newton"
     solver: str | None = None
     has_self_contact: bool = False
     has_stage: bool = False
 
 
-def _of_newton(
-    solver: str, title: str, rate: int, settings: str, claims: str | None = None, *, has_self_contact: bool = False
-) -> Simulator:
-    return Simulator(title, "newton", rate, settings, claims, solver=solver, has_self_contact=has_self_contact)
-
-
 def _with_stage(inner: Simulator) -> Simulator:
-    assert inner.solver
-    settings, claims = "default arguments, without Newton's contacts", "certifies each step, or reports that it did not"
-    title = f"SolverCCD({inner.title})"
-    return Simulator(title, "newton", inner.rate, settings, claims, solver=inner.solver, has_stage=True)
+    settings = "default arguments, without Newton's contacts"
+    return replace(inner, title=f"SolverCCD({inner.title})", settings=settings, claims=_CERTIFIES, has_stage=True)
 
 
-_VBD = _of_newton("vbd", "VBD", 600, "10 iterations, 10 steps a frame: Newton's softbody_hanging")
-_XPBD = _of_newton("xpbd", "XPBD", 600, "10 iterations, 10 steps a frame: Newton's cloth_hanging --solver xpbd")
-_STYLE3D = _of_newton("style3d", "Style3D", 600, "4 iterations, 10 steps a frame: Newton's cloth_style3d")
+_CERTIFIES = "certifies each step, or reports that it did not"
+_VBD = Simulator("VBD", 600, "10 iterations, 10 steps a frame: Newton's softbody_hanging", solver="vbd")
+_XPBD = Simulator("XPBD", 600, "10 iterations, 10 steps a frame: Newton's cloth_hanging --solver xpbd", solver="xpbd")
+_STYLE3D = Simulator("Style3D", 600, "4 iterations, 10 steps a frame: Newton's cloth_style3d", solver="style3d")
 
 SIMULATORS = {
     "vbd": _VBD,
-    "vbd-self-contact": _of_newton(
-        "vbd",
+    "vbd-self-contact": Simulator(
         "VBD, self-contact",
         600,
         "10 iterations, 10 steps a frame; margin and gap of Newton's softbody_dropping_to_cloth and cloth_twist",
         "paths are truncated (Divide and Truncate) so that nothing penetrates, but for pairs within two rings of edges",
+        solver="vbd",
         has_self_contact=True,
     ),
     "style3d": _STYLE3D,
     "xpbd": _XPBD,
-    "semi-implicit": _of_newton(
-        "semi-implicit",
+    "semi-implicit": Simulator(
         "SemiImplicit",
         3840,
         "64 steps a frame; Newton's cloth_hanging --solver semi_implicit has 32, with which light cloth bursts",
+        solver="semi-implicit",
     ),
     "ccd-vbd": _with_stage(_VBD),
     "ccd-style3d": _with_stage(_STYLE3D),
     "ccd-xpbd": _with_stage(_XPBD),
     "implicit": Simulator(
         "SolverImplicit",
-        "newton",
         FRAME_RATE,
         "default arguments, one step a frame, without Newton's contacts",
-        "certifies each step, or reports that it did not",
+        _CERTIFIES,
         solver="implicit",
         has_stage=True,
     ),
     "mujoco-ipc": Simulator(
         "MuJoCo, ipc",
-        "mujoco",
         600,
         "flag ipc, discrete integrator, solver Newton, tolerance 1e-6: MuJoCo's documentation, Deformables",
         "2D flexes cannot tunnel through each other, themselves or static shapes; no friction; experimental",
+        package="mujoco",
     ),
     "libuipc": Simulator(
         "libuipc",
-        "pyuipc",
         120,
         "default configuration, two steps a frame, for its default of 0.01 s; contact from 1 mm on",
         "no penetration from valid starts, while its solves succeed",
+        package="pyuipc",
     ),
 }
 """The simulators by the names of the command."""

@@ -69,8 +69,8 @@ _FREED = (  # of a summary, as the next ones
 _COSTS = (
     Column("Largest move,\nmedian", "move.0", ".2f"),
     Column("at\nmost", "move.1", ".2f"),
-    Column("Strain,\nmedian\n[%]", lambda found: 100 * found.strain[0], ".1f"),
-    Column("at\nmost\n[%]", lambda found: 100 * found.strain[1], ".1f"),
+    Column("Strain,\nmedian\n[%]", lambda found: 100 * found["strain"][0], ".1f"),
+    Column("at\nmost\n[%]", lambda found: 100 * found["strain"][1], ".1f"),
     Column(f"more\nthan\n{100 * STRAIN:.0f}%", "strained"),
     Column("Time,\nmedian\n[s]", "seconds", ".2f"),
 )
@@ -143,31 +143,6 @@ class RepairRun:
         return cls(**values | {"attempts": attempts})
 
 
-@dataclass(frozen=True)
-class DamageSummary:
-    """Repairs of several meshes. Moves, strains and times are those of repairs without a hint.
-
-    Attributes:
-        meshes: Number of meshes.
-        freed: Number of them that were freed without a hint.
-        freed_by_hint: Number that were freed without a hint or with this one.
-        crossings: Smallest and largest number of crossings of an input.
-        move: Median and maximum of the largest moves, in median edge lengths.
-        strain: Median and maximum of the strains.
-        strained: Number of meshes whose strain is more than :data:`STRAIN`.
-        seconds: Median time [s].
-    """
-
-    meshes: int
-    freed: int
-    freed_by_hint: dict[Hint, int]
-    crossings: tuple[int, int]
-    move: tuple[float, float]
-    strain: tuple[float, float]
-    strained: int
-    seconds: float
-
-
 def measure_repair(kind: str, name: str, mesh: TangledMesh, *, device: wp.DeviceLike = None) -> RepairRun:
     """Repairs a mesh, first without a hint, and measures the result.
 
@@ -199,21 +174,29 @@ def measure_repair(kind: str, name: str, mesh: TangledMesh, *, device: wp.Device
     )
 
 
-def summarize(runs: Sequence[RepairRun]) -> DamageSummary:
-    """Returns what repairs of several meshes, at least one, have in common."""
+def summarize(runs: Sequence[RepairRun]) -> dict[str, Any]:
+    """Returns what repairs of several meshes, at least one, have in common.
+
+    Returns:
+        ``meshes``, their number; ``freed``, the number of those that were freed without a hint, and ``freed_by_hint``
+        that without one or with this one; ``crossings``, the smallest and largest number in an input. Of repairs
+        without a hint: ``move``, median and maximum of the largest moves, in median edge lengths; ``strain``, those of
+        the strains; ``strained``, the number of meshes whose strain is more than :data:`STRAIN`; ``seconds``, the
+        median time [s].
+    """
     firsts = [run.attempts[0] for run in runs]
     crossings = [run.crossings for run in runs]
     moves, strains = ([getattr(first, name) for first in firsts] for name in ("largest_move", "strain"))
-    return DamageSummary(
-        meshes=len(runs),
-        freed=sum(run.is_freed() for run in runs),
-        freed_by_hint={hint: sum(run.is_freed(hint) for run in runs) for hint in HINTS},
-        crossings=(min(crossings), max(crossings)),
-        move=(float(np.median(moves)), max(moves)),
-        strain=(float(np.median(strains)), max(strains)),
-        strained=sum(strain > STRAIN for strain in strains),
-        seconds=float(np.median([first.seconds for first in firsts])),
-    )
+    return {
+        "meshes": len(runs),
+        "freed": sum(run.is_freed() for run in runs),
+        "freed_by_hint": {hint: sum(run.is_freed(hint) for run in runs) for hint in HINTS},
+        "crossings": (min(crossings), max(crossings)),
+        "move": (float(np.median(moves)), max(moves)),
+        "strain": (float(np.median(strains)), max(strains)),
+        "strained": sum(strain > STRAIN for strain in strains),
+        "seconds": float(np.median([first.seconds for first in firsts])),
+    }
 
 
 def _hints(mesh: TangledMesh) -> dict[Hint, dict[str, Any]]:

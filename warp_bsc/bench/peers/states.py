@@ -6,7 +6,7 @@ from itertools import combinations
 import newton
 import numpy as np
 
-from ...repairing.contours import connected_components
+from ...detection.at_rest.body_parts import connect_cells
 from ...response.state.mesh import host_array
 from ..scenes.contact import Motion
 
@@ -78,7 +78,7 @@ def find_bodies(model: newton.Model) -> list[Body]:
     pairs = np.concatenate(
         [elements[:, [i, j]] for elements in (triangles, tets) for i, j in combinations(range(elements.shape[1]), 2)]
     )
-    label = connected_components(model.particle_count, pairs)
+    label = connect_cells(pairs, model.particle_count)
     bodies = []
     for first in np.unique(label[pairs]):
         particles = np.flatnonzero(label == first)

@@ -13,7 +13,7 @@ from dataclasses import fields
 import numpy as np
 import warp as wp
 
-from ..mesh import CollisionMesh
+from ..mesh import CollisionMesh, changed_mesh
 from ..narrow.contact_buffer import HostContacts, empty_contacts, read_contacts
 from ..narrow.on_host import pair_distances
 from ..pipeline import DetectionPipeline
@@ -30,18 +30,7 @@ are not much larger than those of their elements."""
 def straight_mesh(mesh: CollisionMesh, turns: np.ndarray) -> CollisionMesh:
     """Returns a mesh with the same elements, in which pairs with a vertex that turns are left out."""
     group = np.uint32(1) if mesh.group is None else mesh.group
-    return CollisionMesh(
-        mesh.faces,
-        mesh.vertex_count,
-        edges=mesh.edges[mesh.free_edges],
-        points=mesh.points,
-        radius=mesh.radius,
-        world=mesh.world,
-        group=np.where(turns, np.uint32(0), group),
-        mask=mesh.mask,
-        only_free=mesh.only_free,
-        device=mesh.device,
-    )
+    return changed_mesh(mesh, group=np.where(turns, np.uint32(0), group))
 
 
 class ArcSearch:

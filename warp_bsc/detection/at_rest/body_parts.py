@@ -160,19 +160,19 @@ def connect_cells(nodes: np.ndarray, count: int) -> np.ndarray:
     """Returns for each node the first one of those that cells connect with it, shape [count].
 
     Args:
-        nodes: Nodes of each cell, shape [n, 3] or [n, 4].
+        nodes: Nodes of each cell, int, shape [n, k].
         count: Number of nodes.
     """
     roots = np.arange(count)
-    while True:
+    while len(nodes):
         of_cells = roots[nodes]
-        lowest = of_cells.min(axis=1)
-        if (of_cells == lowest[:, None]).all():
-            return roots
+        nodes = nodes[(of_cells != of_cells[:, :1]).any(axis=1)]  # cells with one root keep that
+        of_cells = roots[nodes]
         for column in of_cells.T:
-            np.minimum.at(roots, column, lowest)
+            np.minimum.at(roots, column, of_cells.min(axis=1))
         while not np.array_equal(roots, roots[roots]):
             roots = roots[roots]
+    return roots
 
 
 def pair_keys(pairs: np.ndarray, count: int) -> np.ndarray:

@@ -77,13 +77,9 @@ def empty_contacts() -> HostContacts:
 def make_contact_buffer(capacity: int, device: wp.Device) -> ContactBuffer:
     """Returns a buffer with a capacity; only ``within_tolerance`` is initialized, to False."""
     buffer = ContactBuffer()
-    buffer.pairs = wp.empty(capacity, dtype=wp.vec2i, device=device)
-    buffer.status = wp.empty(capacity, dtype=wp.int8, device=device)
-    buffer.decided = wp.empty(capacity, dtype=wp.int8, device=device)
-    buffer.within_tolerance = wp.zeros(capacity, dtype=wp.bool, device=device)
-    buffer.toi = wp.empty(capacity, dtype=wp.float64, device=device)
-    buffer.coordinates = wp.empty(capacity, dtype=wp.vec3d, device=device)
-    buffer.normal = wp.empty(capacity, dtype=wp.vec3d, device=device)
+    for name, var in ContactBuffer.vars.items():
+        setattr(buffer, name, wp.empty(capacity, dtype=var.type.dtype, device=device))
+    buffer.within_tolerance.zero_()
     return buffer
 
 

@@ -127,6 +127,17 @@ def add_stats(first: DetectionStats, second: DetectionStats) -> DetectionStats:
     return DetectionStats(**buffers, milliseconds=dict(milliseconds))
 
 
+@dataclass(frozen=True)
+class _Column:
+    """An attribute of :class:`Collisions`: an array of the pairs of one kind."""
+
+    kind: PairKind
+    name: str
+
+    def __get__(self, collisions: "Collisions", _class: type) -> np.ndarray:
+        return getattr(collisions._contacts(self.kind), self.name)
+
+
 @dataclass(frozen=True, eq=False)
 class Collisions:
     """The collisions of one motion, sorted, the same on every run and every device.
@@ -145,6 +156,32 @@ class Collisions:
             detection in a CUDA graph can overflow: detect once outside a graph, which enlarges the buffers, and capture
             again.
         arrays: The collisions on the device, with gradients; None unless ``x0`` or ``x1`` requires gradients.
+        vertex_face: (vertex, face), int32, shape [n, 2].
+        edge_edge: (edge, edge), the smaller first, as in ``mesh.edges``, int32, shape [m, 2].
+        vertex_face_toi: Times of impact as a share of the step, float64, shape [n]: no contact of the pair comes
+            earlier. They are at most the tolerance before the first contact, except for UNSURE pairs of "float" and
+            "conservative".
+        edge_edge_toi: Times of impact of the edges, as :attr:`vertex_face_toi`, float64, shape [m].
+        vertex_face_coordinates: Barycentric coordinates of the contact in the face, float64, shape [n, 3].
+        edge_edge_coordinates: (s, r, 0) along the two edges, float64, shape [m, 3].
+        vertex_face_normal: Unit normals of the faces at contact, float64, shape [n, 3]. They are on the side from which
+            the vertex comes: against its velocity relative to the face. A vertex that moves in the plane of the face
+            comes from neither: its normal is that of the plane, of either sign, perpendicular to the velocity, so that
+            a push along it parts nothing. A face that has collapsed has no plane: the normal is opposite to the
+            velocity, and (0, 0, 1) where there is none. With a minimum distance those of all pairs are along the
+            closest points, from the second element to the first.
+        edge_edge_normal: Unit normals of both edges at contact, float64, shape [m, 3]. They are perpendicular to both,
+            against the velocity of the first relative to the second, and otherwise as :attr:`vertex_face_normal`:
+            perpendicular to that velocity for edges that move in their plane, opposite to it for edges that are
+            parallel.
+        vertex_edge: (point, edge), points as in ``mesh.points``, edges of no face, int32, shape [k, 2]. With a minimum
+            distance only, as :attr:`vertex_vertex`: pairs of points with faces are in :attr:`vertex_face`.
+        vertex_vertex: (point, point), the smaller first, int32, shape [l, 2].
+        vertex_edge_toi: Times of impact of points with edges, as :attr:`vertex_face_toi`, float64, shape [k].
+        vertex_vertex_toi: Times of impact of points with points, as :attr:`vertex_face_toi`, float64, shape [l].
+        vertex_edge_coordinates: (s, 0, 0) along the edge, float64, shape [k, 3].
+        vertex_edge_normal: Unit normals from the edge to the point, float64, shape [k, 3].
+        vertex_vertex_normal: Unit normals from the second point to the first, float64, shape [l, 3].
     """
 
     certified: bool
@@ -155,6 +192,22 @@ class Collisions:
     _rows: dict[PairKind, ContactRows] = field(repr=False)
     _timer: PhaseTimer | PhaseTimers = field(repr=False)
     _read: dict[PairKind, HostContacts] = field(default_factory=dict, init=False, repr=False)
+
+    vertex_face = _Column(PairKind.VERTEX_FACE, "pairs")
+    edge_edge = _Column(PairKind.EDGE_EDGE, "pairs")
+    vertex_face_toi = _Column(PairKind.VERTEX_FACE, "toi")
+    edge_edge_toi = _Column(PairKind.EDGE_EDGE, "toi")
+    vertex_face_coordinates = _Column(PairKind.VERTEX_FACE, "coordinates")
+    edge_edge_coordinates = _Column(PairKind.EDGE_EDGE, "coordinates")
+    vertex_face_normal = _Column(PairKind.VERTEX_FACE, "normal")
+    edge_edge_normal = _Column(PairKind.EDGE_EDGE, "normal")
+    vertex_edge = _Column(PairKind.VERTEX_EDGE, "pairs")
+    vertex_vertex = _Column(PairKind.VERTEX_VERTEX, "pairs")
+    vertex_edge_toi = _Column(PairKind.VERTEX_EDGE, "toi")
+    vertex_vertex_toi = _Column(PairKind.VERTEX_VERTEX, "toi")
+    vertex_edge_coordinates = _Column(PairKind.VERTEX_EDGE, "coordinates")
+    vertex_edge_normal = _Column(PairKind.VERTEX_EDGE, "normal")
+    vertex_vertex_normal = _Column(PairKind.VERTEX_VERTEX, "normal")
 
     def __len__(self) -> int:
         """Returns the number of pairs of all kinds."""
@@ -176,99 +229,6 @@ class Collisions:
         if kind not in self._read:
             self._read[kind] = self._rows[kind].read() if kind in self._rows else empty_contacts()
         return self._read[kind]
-
-    @property
-    def vertex_face(self) -> np.ndarray:
-        """(vertex, face), int32, shape [n, 2]."""
-        return self._contacts(PairKind.VERTEX_FACE).pairs
-
-    @property
-    def edge_edge(self) -> np.ndarray:
-        """(edge, edge), the smaller first, as in ``mesh.edges``, int32, shape [m, 2]."""
-        return self._contacts(PairKind.EDGE_EDGE).pairs
-
-    @property
-    def vertex_face_toi(self) -> np.ndarray:
-        """Times of impact as a share of the step, float64, shape [n]: no contact of the pair comes earlier.
-
-        They are at most the tolerance before the first contact, except for UNSURE pairs of "float" and "conservative".
-        """
-        return self._contacts(PairKind.VERTEX_FACE).toi
-
-    @property
-    def edge_edge_toi(self) -> np.ndarray:
-        """Times of impact of the edges, as :attr:`vertex_face_toi`, float64, shape [m]."""
-        return self._contacts(PairKind.EDGE_EDGE).toi
-
-    @property
-    def vertex_face_coordinates(self) -> np.ndarray:
-        """Barycentric coordinates of the contact in the face, float64, shape [n, 3]."""
-        return self._contacts(PairKind.VERTEX_FACE).coordinates
-
-    @property
-    def edge_edge_coordinates(self) -> np.ndarray:
-        """(s, r, 0) along the two edges, float64, shape [m, 3]."""
-        return self._contacts(PairKind.EDGE_EDGE).coordinates
-
-    @property
-    def vertex_face_normal(self) -> np.ndarray:
-        """Unit normals of the faces at contact, float64, shape [n, 3].
-
-        They are on the side from which the vertex comes: against its velocity relative to the face. A vertex that moves
-        in the plane of the face comes from neither: its normal is that of the plane, of either sign, perpendicular to
-        the velocity, so that a push along it parts nothing. A face that has collapsed has no plane: the normal is
-        opposite to the velocity, and (0, 0, 1) where there is none.
-        With a minimum distance those of all pairs are along the closest points, from the second element to the first.
-        """
-        return self._contacts(PairKind.VERTEX_FACE).normal
-
-    @property
-    def edge_edge_normal(self) -> np.ndarray:
-        """Unit normals of both edges at contact, float64, shape [m, 3].
-
-        They are perpendicular to both, against the velocity of the first relative to the second, and otherwise as
-        :attr:`vertex_face_normal`: perpendicular to that velocity for edges that move in their plane, opposite to it
-        for edges that are parallel.
-        """
-        return self._contacts(PairKind.EDGE_EDGE).normal
-
-    @property
-    def vertex_edge(self) -> np.ndarray:
-        """(point, edge), points as in ``mesh.points``, edges of no face, int32, shape [k, 2].
-
-        With a minimum distance only, as :attr:`vertex_vertex`: pairs of points with faces are in :attr:`vertex_face`.
-        """
-        return self._contacts(PairKind.VERTEX_EDGE).pairs
-
-    @property
-    def vertex_vertex(self) -> np.ndarray:
-        """(point, point), the smaller first, int32, shape [l, 2]."""
-        return self._contacts(PairKind.VERTEX_VERTEX).pairs
-
-    @property
-    def vertex_edge_toi(self) -> np.ndarray:
-        """Times of impact of points with edges, as :attr:`vertex_face_toi`, float64, shape [k]."""
-        return self._contacts(PairKind.VERTEX_EDGE).toi
-
-    @property
-    def vertex_vertex_toi(self) -> np.ndarray:
-        """Times of impact of points with points, as :attr:`vertex_face_toi`, float64, shape [l]."""
-        return self._contacts(PairKind.VERTEX_VERTEX).toi
-
-    @property
-    def vertex_edge_coordinates(self) -> np.ndarray:
-        """(s, 0, 0) along the edge, float64, shape [k, 3]."""
-        return self._contacts(PairKind.VERTEX_EDGE).coordinates
-
-    @property
-    def vertex_edge_normal(self) -> np.ndarray:
-        """Unit normals from the edge to the point, float64, shape [k, 3]."""
-        return self._contacts(PairKind.VERTEX_EDGE).normal
-
-    @property
-    def vertex_vertex_normal(self) -> np.ndarray:
-        """Unit normals from the second point to the first, float64, shape [l, 3]."""
-        return self._contacts(PairKind.VERTEX_VERTEX).normal
 
     @functools.cached_property
     def earliest_toi(self) -> float:

@@ -62,6 +62,19 @@ class Finding:
         return not self.hits and not self.near and not any(self.crossings)
 
 
+def count_found(findings: list[Finding], min_distance: float) -> dict[str, int]:
+    """Returns the numbers of collisions and intersections, and of others that there may be, by their names."""
+    crossings = sum(finding.crossings[0] for finding in findings) + findings[-1].crossings[1]
+    counts = {"collisions": sum(finding.hits for finding in findings), "intersections": crossings}
+    if min_distance:
+        counts[f"pairs nearer than {min_distance:g}"] = sum(finding.near for finding in findings)
+    if findings[0].unrepaired_pairs:
+        counts["collisions of meshes that cross at the first frame"] = sum(
+            finding.unrepaired_hits for finding in findings
+        )
+    return counts
+
+
 def kept_meshes(scene: Scene, keep: Iterable[str] = ()) -> dict[str, str]:
     """Returns the meshes of a scene that a repair does not move, and why, by their names.
 

@@ -1,7 +1,7 @@
 """Positions of a mesh at one time from those at the time before: near given ones, and reached without a collision."""
 
 import functools
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,6 +15,7 @@ from ..contacts import Contacts, as_contacts, projected
 from ..elastic import Springs
 from ..surface import Surface
 from .follow_kernels import find_directions, normalize, smooth
+from .stretch import ShotFrame
 
 if TYPE_CHECKING:
     from .playback import Playback
@@ -49,27 +50,6 @@ _LEAST_LENGTH = 1e-3
 """Length of an edge, as a share of the median, below which any change of its length is small."""
 _TIMES = 9
 """Times from a contact on an arc on at which it is looked how far the elements would pass through each other."""
-
-
-@dataclass(frozen=True)
-class FollowedFrame:
-    """The positions at the end of a step.
-
-    Attributes:
-        x: Positions, float32, shape [vertex_count, 3].
-        displacement: The displacements that were added to the given positions before the last contacts were moved
-            apart, float64, shape [vertex_count, 3].
-        certified: Whether the motion to these positions, straight or on arcs, is free of collisions, and keeps the
-            distance.
-        contacts: The contacts that are kept apart there.
-        unrelaxed: Positions before springs relaxed them, which are free as well; None if they have not.
-    """
-
-    x: np.ndarray
-    displacement: np.ndarray
-    certified: bool
-    contacts: Contacts
-    unrelaxed: np.ndarray | None = None
 
 
 class Follower:
@@ -128,7 +108,7 @@ class Follower:
         free_start: np.ndarray | None = None,
         arcs: RigidMotion | None = None,
         relaxes: bool = False,
-    ) -> FollowedFrame:
+    ) -> ShotFrame:
         """Returns positions near given ones that a straight motion reaches without a collision.
 
         Args:
@@ -146,7 +126,7 @@ class Follower:
         """
         tolerance *= self.length
         device_start = self.mesh.device_positions(start, "start")
-        best: tuple[float, FollowedFrame] | None = None
+        best: tuple[float, ShotFrame] | None = None
         sweeps = list(_SWEEPS)
         target = _displaced(given, displacement)
         x, changed = self._moved_apart(target, known), self._is_movable
@@ -161,7 +141,7 @@ class Follower:
             unspread = float(np.linalg.norm(x.astype(np.float64) - target, axis=1).max(initial=0.0))
             if is_free:
                 if best is None or unspread < best[0]:
-                    best = unspread, FollowedFrame(x, displacement, True, known)
+                    best = unspread, ShotFrame(given, x, displacement, True, known)
                 if unspread < tolerance or not sweeps:
                     break
             elif not len(contacts.toi):
@@ -181,26 +161,24 @@ class Follower:
                     target = _displaced(given, displacement)
                     x = self._moved_apart(target, known)
             changed = touched | (x.astype(np.float32) != last).any(axis=1)
-        frame = FollowedFrame(target, displacement, False, known) if best is None else best[1]
+        frame = ShotFrame(given, target, displacement, False, known) if best is None else best[1]
         if relaxes:
-            frame = self._relaxed(frame, start, given, arcs)
+            frame = self._relaxed(frame, start, arcs)
         if frame.certified:
             return frame
         x, certified = self._playback.step(start, x.astype(np.float32))
         if certified and arcs is not None:  # the stage knows the chords alone
             _, touched = self._contacts(device_start, x, self._is_movable, arcs)
             certified = not touched.any()
-        frame = FollowedFrame(x, displacement, certified, known)
-        return self._relaxed(frame, start, given, arcs) if relaxes and certified else frame
+        frame = ShotFrame(given, x, displacement, certified, known)
+        return self._relaxed(frame, start, arcs) if relaxes and certified else frame
 
-    def _relaxed(
-        self, frame: FollowedFrame, start: np.ndarray, given: np.ndarray, arcs: RigidMotion | None
-    ) -> FollowedFrame:
+    def _relaxed(self, frame: ShotFrame, start: np.ndarray, arcs: RigidMotion | None) -> ShotFrame:
         """Returns a frame with less strain, or any that is free if the given one is not; that one if none is found.
 
         Arguments are those of :meth:`follow`.
         """
-        strain = self._strain(frame.x, given) if frame.certified else np.inf
+        given, strain = frame.given, self._strain(frame.x, frame.given) if frame.certified else np.inf
         if strain < _STRAINED:
             return frame
         springs, known, x = self._springs, frame.contacts, frame.x.astype(np.float64)
@@ -224,7 +202,7 @@ class Follower:
             if remaining >= strain:
                 break
             unrelaxed = frame.unrelaxed if frame.unrelaxed is not None else frame.x if frame.certified else None
-            frame = FollowedFrame(goal, frame.displacement, True, known, unrelaxed)
+            frame = replace(frame, x=goal, certified=True, contacts=known, unrelaxed=unrelaxed)
             strain = remaining
             if strain < _STRAINED:
                 break

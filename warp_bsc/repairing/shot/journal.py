@@ -9,7 +9,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from ...scene_replay.earlier import describe_difference
+from ...scene_replay.earlier import find_difference
 from ...usd.scene import Scene
 from ...usd.write.points_layer import MovedFrame
 from .findings import Finding
@@ -117,10 +117,8 @@ class Journal:
                 facts, findings = head["facts"], json.loads(file.readline())
             except (ValueError, KeyError, TypeError):
                 raise ValueError(f"{self.path}: not a resumable repair of this version") from None
-            for fact in self._facts:
-                if facts.get(fact) != self._facts[fact]:
-                    difference = describe_difference(fact, facts, self._facts)
-                    raise ValueError(f"{self.path}: written with other options or files; cannot resume: {difference}")
+            if difference := find_difference(facts, self._facts):
+                raise ValueError(f"{self.path}: written with other options or files; cannot resume: {difference}")
             self.findings = [_as_finding(fields) for fields in findings]
             end = file.tell()
             size = file.seek(0, os.SEEK_END)

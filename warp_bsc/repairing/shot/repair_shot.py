@@ -18,7 +18,7 @@ from ..contacts import Contacts
 from ..repair import repair
 from .blend import MARGIN, blend
 from .findings import Finding, kept_meshes
-from .follow import FollowedFrame, Follower
+from .follow import Follower
 from .mesh_groups import groups_of
 from .stretch import FollowedMesh, RepairedStretch, ShotFrame, StretchRecorder
 
@@ -261,13 +261,13 @@ class _Shot:
                 if displacements is None:
                     known = contacts[index] = found.contacts
                 added = found.displacement if displacements is None else found.x - given
-                frame = ShotFrame(given, found.x, added.astype(np.float32), found.certified, found.unrelaxed)
+                frame = replace(found, displacement=added.astype(np.float32))
             if index > first:
                 yield before
         if frame is not start:
             yield frame
 
-    def _follow_to(self, interval, start: ShotFrame, displacement, options) -> FollowedFrame:
+    def _follow_to(self, interval, start: ShotFrame, displacement, options) -> ShotFrame:
         """Returns the positions at the end of an interval; ``options`` are those of :meth:`.Follower.follow`."""
         is_free = self._findings[interval.index].is_free and self._is_single
         return self._follower.follow(

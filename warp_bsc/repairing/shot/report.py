@@ -15,11 +15,8 @@ from ...scene_replay.page_view import choose_faces
 from ...usd.scene import Scene
 from ...usd.segment import Segment
 from ...usd.write.points_layer import MovedFrame
-from .findings import Finding
+from .findings import Finding, count_found
 from .stretch import RepairedStretch, distortion
-
-UNREPAIRED_HITS = "collisions of meshes that cross at the first frame"
-"""What remains of pairs of meshes that stay as they are."""
 
 _ALL_FACES = (
     3_000_000  # about 25 MB, in the views of all frames together; divided by their number, the limit of a frame ...
@@ -135,14 +132,9 @@ class _Summary:
         for frame in self.frames:
             moves[frame["time"]] = max(moves[frame["time"]], frame["move"])
         uncertified = sum(len(stretch.uncertified) for stretch in stretches)
-        tiles = [
-            _left(before, after, "collisions", lambda found: found.hits),
-            _left(before, after, "intersections", lambda found: found.crossings[0], last=True),
-        ]
-        if min_distance:
-            tiles.append(_left(before, after, f"pairs nearer than {min_distance:g}", lambda found: found.near))
-        if before[0].unrepaired_pairs:
-            tiles.append(_left(before, after, UNREPAIRED_HITS, lambda found: found.unrepaired_hits))
+        left = {} if after is None else count_found(after, min_distance)
+        found = count_found(before, min_distance).items()
+        tiles = [(f"{left[what]:,}" if left else "?", f"{what}, of {number:,} before") for what, number in found]
         ratios = [stretch.edge_ratio for stretch in stretches]
         tiles += [
             (f"{len(moves.keys() & {frame['time'] for frame in self.frames}):,} of {len(moves):,}", "frames moved"),
@@ -291,22 +283,6 @@ def _rows(scene: Scene, findings: list[Finding]) -> list[tuple[float, float, int
         start, end, hits, crossings, near = rows[-1]
         rows[-1] = start, end, hits, crossings + findings[-1].crossings[1], near
     return rows
-
-
-def _left(
-    before: list[Finding],
-    after: list[Finding] | None,
-    what: str,
-    number: Callable[[Finding], int],
-    *,
-    last: bool = False,
-) -> tuple[str, str]:
-    """Returns how many findings remain and were there before, in words; ``last`` adds the crossings at the end."""
-    sums = [
-        None if findings is None else sum(map(number, findings)) + last * findings[-1].crossings[1]
-        for findings in (before, after)
-    ]
-    return "?" if sums[1] is None else f"{sums[1]:,}", f"{what}, of {sums[0]:,} before"
 
 
 def _title(scene: Scene) -> str:

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ...usd.write.points_layer import MovedFrame
+from ..contacts import Contacts
 
 _GOOD_EDGES = 1.0 / 3.0, 2.0
 """Smallest and largest length of an edge in a frame that is good, as shares of its length in the shot."""
@@ -67,15 +68,18 @@ class ShotFrame:
     Attributes:
         given: Positions in the shot, float32, shape [vertex_count, 3].
         x: Positions that follow it, likewise.
-        displacement: What was added to the shot before the last response, float32, likewise.
-        certified: Whether the motion from the frame before is certified.
-        unrelaxed: Positions to which the motion is certified too, with more strain; None if there are none.
+        displacement: What was added to the shot before the last contacts were moved apart, likewise.
+        certified: Whether the motion from the frame before, straight or on arcs, is free of collisions, and keeps the
+            distance.
+        contacts: The contacts that are kept apart there.
+        unrelaxed: Positions before springs relaxed them, to which the motion is certified too; None if they have not.
     """
 
     given: np.ndarray
     x: np.ndarray
     displacement: np.ndarray
     certified: bool = True
+    contacts: Contacts = field(default_factory=Contacts.none)
     unrelaxed: np.ndarray | None = None
 
     @staticmethod

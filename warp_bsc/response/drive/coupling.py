@@ -14,7 +14,7 @@ from ..state.poses import in_world
 from ..state.structs import Motion, Vertices
 from ..state.vectors import to_double, to_single
 from ..state.workspace import Workspace
-from ..wrapped_solver import WrappedSolver
+from ..wrapped_solver import WrappedSolver, innermost
 from .snapshot import Snapshot
 
 wp.set_module_options({"enable_backward": False})
@@ -81,9 +81,7 @@ def _add_impulses(
 
 def _is_default(solver, hook):
     """Returns whether a hook of a solver is the default of the interface."""
-    while isinstance(solver, WrappedSolver):
-        solver = solver.solver
-    return getattr(type(solver), hook, None) in (None, getattr(CouplingInterface, hook))
+    return getattr(type(innermost(solver)), hook, None) in (None, getattr(CouplingInterface, hook))
 
 
 class CouplingHooks(WrappedSolver):

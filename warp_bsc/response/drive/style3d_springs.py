@@ -266,6 +266,8 @@ class Style3DContacts:
     def frame_begin(self, *_arguments) -> None:
         """Does nothing: :meth:`find` has found the contacts."""
 
+    linear_iteration_end = frame_end = frame_begin
+
     def accumulate_contact_force(
         self,
         dt: float,
@@ -290,12 +292,6 @@ class Style3DContacts:
         self._product.zero_()
         self._launch(_multiply, [x, self._product])
         return self._product
-
-    def linear_iteration_end(self, *_arguments) -> None:
-        """Does nothing."""
-
-    def frame_end(self, *_arguments) -> None:
-        """Does nothing."""
 
 
 class SpringSteps(InnerSteps):

@@ -59,7 +59,7 @@ class SolverReport:
 
     def __init__(self, work: Workspace, *, responds: bool = True):
         """Reports on the steps in which a response resolves a motion, or only inspects it."""
-        self._motion, self._work, self.responds = work.motion, work, responds
+        self._motion, self._work, self._mesh, self.responds = work.motion, work, work.mesh, responds
         self.model, self.shape_of_vertices = work.mesh.model, work.mesh.shape_vertices.shape
         self.step_results = StepResults()
         self.step_results.results = wp.zeros(len(Result), dtype=int, device=work.device)
@@ -414,10 +414,6 @@ class SolverReport:
         Searches for what is inside, on the host.
         """
         return line_of(self)
-
-    @property
-    def _mesh(self):
-        return self._work.mesh
 
     @property
     def prevents_inversions(self) -> bool:

@@ -9,7 +9,7 @@ from ..._warnings import warn_caller
 from ..state.motion import SET_STEPS
 from ..state.structs import NOT_FINITE
 from ..tuning import MAX_STRAIN
-from .text import not_finite_warning, revoked_warning, set_bodies_warning, shape_name, uncertified_warning
+from .text import NAMED, first_of, name_particles, shape_name
 
 _CROSSINGS = (
     "edges pass through faces at the start of a step, and their contacts are delegated to the solver: "
@@ -67,20 +67,43 @@ class StepWarnings:
             self.once("set_bodies", self._of_set_bodies)
 
     def _of_not_finite(self):
-        model = self._report.model
-        found = self._report.outcomes.find(NOT_FINITE)[: model.particle_count]
-        return not_finite_warning(model, np.flatnonzero(found))
+        model, find = self._report.model, self._report.outcomes.find
+        particles = np.flatnonzero(find(NOT_FINITE)[: model.particle_count])  # none if that was an earlier step
+        named = f" ({', '.join(name_particles(model, particles))})" if len(particles) else ""
+        return (
+            f"positions or velocities of particles{named} were not finite after the inner solver in a step: the "
+            "particles stayed where they were, and the step is not certified (see report.not_finite)"
+        )
 
     def _of_revoked(self):
-        coupled = self._report.coupled
+        coupled, labels = self._report.coupled, self._report.model.body_label
         passed = coupled.find_passed()
-        return revoked_warning(self._report.model, passed if len(passed) else coupled.bodies)
+        named = first_of([f"body {i} ({labels[i]!r})" for i in (passed if len(passed) else coupled.bodies)])
+        return (
+            "in the state of the program a step is not certified, although it is as its entry of a coupled solver sees "
+            f"it: {named or 'particles of another entry'} may pass through particles of this one. "
+            "report.totals.revoked_steps counts such steps; to have none, put SolverCCD around the coupled solver, see "
+            "Robots in the documentation"
+        )
 
     def _of_uncertified(self):
         report, model = self._report, self._report.model
         listed, first = report.outcomes.find_uncertified(), model.particle_count
         particles, shapes = np.flatnonzero(listed[:first]), np.unique(report.shape_of_vertices[listed[first:]])
-        return uncertified_warning(model, particles, shapes, may_invert=report.prevents_inversions)
+        if not len(particles) and not len(shapes):
+            return (
+                "a step was not certified, and a later one is: read report.certified after each step, "
+                "or report.totals.uncertified_steps"
+            )
+        named = name_particles(model, particles) + [shape_name(model, shape) for shape in shapes[:NAMED]]
+        if len(shapes) > NAMED:
+            named.append(f"{len(shapes) - NAMED} more shapes")
+        or_invert = ", or invert a tetrahedron" if report.prevents_inversions else ""
+        return (
+            f"a step is not certified, its motion may pass through something{or_invert}: {', '.join(named)}. "
+            "To look closer: report.uncertified_vertices and report.uncertified_bodies list all of that step, and "
+            "report.draw(viewer) shows them in red"
+        )
 
     def _of_strain(self):
         report = self._report
@@ -90,4 +113,8 @@ class StepWarnings:
 
     def _of_set_bodies(self):
         labels, bodies = self._report.model.body_label, np.flatnonzero(self._report.set_steps.numpy() == SET_STEPS)
-        return set_bodies_warning([f"body {body} ({labels[body]!r})" for body in bodies])
+        named = first_of([f"body {body} ({labels[body]!r})" for body in bodies])
+        return (
+            f"a program writes the pose of dynamic bodies between steps ({named}): the stage does not see their way "
+            "there, on which they pass through things. Add what a program moves with is_kinematic=True"
+        )

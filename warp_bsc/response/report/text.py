@@ -9,7 +9,8 @@ from ..tuning import MAX_STRAIN
 
 _LABEL = 36  # characters
 _MOST_ROWS = 40
-_NAMED = 3  # particles or shapes that a warning names
+NAMED = 3
+"""Particles or shapes that a warning names."""
 
 
 def shape_name(model: newton.Model, shape: int) -> str:
@@ -56,77 +57,25 @@ def table_by_shape(model: newton.Model, contacts: dict[str, np.ndarray], dt: flo
     return "\n".join(lines)
 
 
-def _name_particles(model, particles):
+def name_particles(model: newton.Model, particles: np.ndarray) -> list[str]:
     """Returns number and world of the first of some particles, and how many more there are."""
     world = None if model.particle_world is None or model.world_count <= 1 else model.particle_world.numpy()
-    named = [f"particle {i}" + ("" if world is None else f" of world {world[i]}") for i in particles[:_NAMED]]
-    if len(particles) > _NAMED:
-        named.append(f"{len(particles) - _NAMED} more particles")
+    named = [f"particle {i}" + ("" if world is None else f" of world {world[i]}") for i in particles[:NAMED]]
+    if len(particles) > NAMED:
+        named.append(f"{len(particles) - NAMED} more particles")
     return named
 
 
-def _first(names: list[str]) -> str:
+def first_of(names: list[str]) -> str:
     """Returns the first of some names, and how many more there are."""
-    return ", ".join(names[:_NAMED] + [f"{len(names) - _NAMED} more"] * (len(names) > _NAMED))
-
-
-def set_bodies_warning(bodies: list[str]) -> str:
-    """Returns what to say of dynamic bodies, by name, whose pose a program writes between steps."""
-    return (
-        f"a program writes the pose of dynamic bodies between steps ({_first(bodies)}): the stage does not see their "
-        "way there, on which they pass through things. Add what a program moves with is_kinematic=True"
-    )
-
-
-def not_finite_warning(model: newton.Model, particles: np.ndarray) -> str:
-    """Returns what to say of a step in which particles had no finite prediction, empty if that was an earlier step."""
-    named = f" ({', '.join(_name_particles(model, particles))})" if len(particles) else ""
-    return (
-        f"positions or velocities of particles{named} were not finite after the inner solver in a step: the particles "
-        "stayed where they were, and the step is not certified (see report.not_finite)"
-    )
+    return ", ".join(names[:NAMED] + [f"{len(names) - NAMED} more"] * (len(names) > NAMED))
 
 
 def unseen_warning(labels: list[str]) -> str:
     """Returns what to say of shapes, by their labels, that an entry of a coupled solver does not see."""
     return (
-        f"the entry of a coupled solver does not see {_first([repr(label) for label in labels])}, which collide with "
+        f"the entry of a coupled solver does not see {first_of([repr(label) for label in labels])}, which collide with "
         "particles: its particles pass through them, and no certificate covers that; make proxies of their bodies"
-    )
-
-
-def revoked_warning(model: newton.Model, bodies: np.ndarray) -> str:
-    """Returns what to say of a step that is certified as an entry of a coupled solver sees it, but not in the end."""
-    named = _first([f"body {i} ({model.body_label[i]!r})" for i in bodies])
-    return (
-        "in the state of the program a step is not certified, although it is as its entry of a coupled solver sees it: "
-        f"{named or 'particles of another entry'} may pass through particles of this one. "
-        "report.totals.revoked_steps counts such steps; to have none, put SolverCCD around the coupled solver, see "
-        "Robots in the documentation"
-    )
-
-
-def uncertified_warning(
-    model: newton.Model, particles: np.ndarray, shapes: np.ndarray, *, may_invert: bool = False
-) -> str:
-    """Returns what to say of a step that is not certified, given the particles and shapes concerned.
-
-    With ``may_invert`` it may also lack the certificate because a tetrahedron inverts.
-    """
-    if not len(particles) and not len(shapes):
-        return (
-            "a step was not certified, and a later one is: read report.certified after each step, "
-            "or report.totals.uncertified_steps"
-        )
-    named = _name_particles(model, particles)
-    named += [shape_name(model, shape) for shape in shapes[:_NAMED]]
-    if len(shapes) > _NAMED:
-        named.append(f"{len(shapes) - _NAMED} more shapes")
-    or_invert = ", or invert a tetrahedron" if may_invert else ""
-    return (
-        f"a step is not certified, its motion may pass through something{or_invert}: {', '.join(named)}. "
-        "To look closer: report.uncertified_vertices and report.uncertified_bodies list all of that step, and "
-        "report.draw(viewer) shows them in red"
     )
 
 

@@ -96,6 +96,19 @@ class ContactReport:
 
     Sums reach 130,000 N s, of impulses of up to 65,000 N s each, in units of 1.5e-14 N s, and are the same in any order
     of threads; :attr:`complete` is false where that is not enough.
+
+    Attributes:
+        particle_impulse: Change of momentum of each particle by the response [N s], vec3, shape [particle_count]. It is
+            the mass by the change of velocity that the stage made, up to rounding. Of a particle that nothing can move,
+            it is the impulse on what holds it.
+        unpaired_particle_impulse: The part of :attr:`particle_impulse` that no contact has, likewise. Velocities that
+            follow from a path that was cut, those of frozen particles, and the turn that restores the angular momentum
+            of a world are of no pair. The turn has no linear momentum; paths that are cut do not conserve it.
+        body_impulse: Impulse on each body [N s], and about its centre of mass [N m s], spatial_vector, shape
+            [body_count], linear first. Of a body that the response moves, it is its change of momentum. On others, such
+            as kinematic fingers, contacts act all the same.
+        unpaired_body_impulse: The part of :attr:`body_impulse` that no contact has, likewise.
+        shape_impulse: Impulse of contacts on each shape [N s], vec3, shape [shape_count].
     """
 
     def __init__(
@@ -110,50 +123,15 @@ class ContactReport:
             shapes_of_worlds: The shapes of each world, those in all worlds first, then -1, int32, shape
                 [world_count, n].
         """
-        self._model, self._rows, self._sums, self.shapes_of_worlds = model, rows, published, shapes_of_worlds
+        self._model, self._rows, self._of_pairs, self.shapes_of_worlds = model, rows, published.pair, shapes_of_worlds
+        self.particle_impulse, self.unpaired_particle_impulse = published.particle, published.unpaired_particle
+        self.body_impulse, self.unpaired_body_impulse = published.body, published.unpaired_body
+        self.shape_impulse = published.shape
 
     @property
     def contacts(self) -> Contacts:
         """The contacts of the last step that had an impulse."""
         return Contacts(*(getattr(self._rows, name) for name in ["count", *_COLUMNS, "lost"]))
-
-    @property
-    def particle_impulse(self) -> wp.array[wp.vec3]:
-        """Change of momentum of each particle by the response [N s], shape [particle_count].
-
-        It is the mass by the change of velocity that the stage made, up to rounding. Of a particle that nothing can
-        move, it is the impulse on what holds it.
-        """
-        return self._sums.particle
-
-    @property
-    def unpaired_particle_impulse(self) -> wp.array[wp.vec3]:
-        """The part of :attr:`particle_impulse` that no contact has [N s], shape [particle_count].
-
-        Velocities that follow from a path that was cut, those of frozen particles, and the turn that restores the
-        angular momentum of a world are of no pair. The turn has no linear momentum; paths that are cut do not conserve
-        it.
-        """
-        return self._sums.unpaired_particle
-
-    @property
-    def body_impulse(self) -> wp.array[wp.spatial_vector]:
-        """Impulse on each body [N s], and about its centre of mass [N m s], shape [body_count], linear first.
-
-        Of a body that the response moves, it is its change of momentum. On others, such as kinematic fingers, contacts
-        act all the same.
-        """
-        return self._sums.body
-
-    @property
-    def unpaired_body_impulse(self) -> wp.array[wp.spatial_vector]:
-        """The part of :attr:`body_impulse` that no contact has, as :attr:`unpaired_particle_impulse`."""
-        return self._sums.unpaired_body
-
-    @property
-    def shape_impulse(self) -> wp.array[wp.vec3]:
-        """Impulse of contacts on each shape [N s], shape [shape_count]."""
-        return self._sums.shape
 
     @property
     def shape_pair_impulse(self) -> wp.array:
@@ -165,7 +143,7 @@ class ContactReport:
         Raises:
             RuntimeError: If there are more than 2^20 entries: sum up :attr:`contacts` instead.
         """
-        pairs, (worlds, local) = self._sums.pair, self.shapes_of_worlds.shape
+        pairs, (worlds, local) = self._of_pairs, self.shapes_of_worlds.shape
         if not len(pairs):
             entries = worlds * (local + 1) ** 2
             raise RuntimeError(f"shape_pair_impulse would have {entries} entries: sum up contacts by shapes instead")
