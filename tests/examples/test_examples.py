@@ -268,7 +268,7 @@ def test_a_propeller_throws_a_cloth_that_passes_it_without_stage(capsys):
         run(PROPELLER, 8, "--no-ccd").test_final()
 
 
-@pytest.mark.parametrize("robot", ["featherstone", "mujoco"])
+@pytest.mark.parametrize("robot", [pytest.param("featherstone", marks=pytest.mark.slow), "mujoco"])
 @pytest.mark.parametrize("friction", [0.5, pytest.param(0.05, marks=pytest.mark.slow)])
 def test_gripper_lifts_cloth_that_does_not_slip(robot, friction):
     if robot == "mujoco":

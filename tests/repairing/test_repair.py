@@ -357,7 +357,7 @@ def test_a_minimum_distance_is_kept():
     assert not result.crossings
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("dtype", [pytest.param(np.float32, marks=pytest.mark.slow), np.float64])
 def test_layers_keep_their_own_distances(dtype):
     """Skin, a shirt that dips into it, and a jacket that dips into the shirt: 2 mm, 5 mm and 3 mm, in the end."""
     ball = trimesh.creation.icosphere(3)

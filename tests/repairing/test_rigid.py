@@ -39,7 +39,7 @@ def assert_rigid(before, after, group):
             assert np.linalg.det(np.linalg.lstsq(a, b, rcond=1e-6)[0]) >= -1e-6
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("turn", [0.0, 0.7])
 @pytest.mark.parametrize("fixed", ["nothing", "sheet"])
 def test_buttons_leave_a_sheet_as_a_whole(dtype, turn, fixed):
@@ -129,7 +129,7 @@ def least_distance(faces, x, group):
     return least
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [pytest.param(k, marks=[pytest.mark.slow] * (k == "stacks")) for k in KINDS])
 @settings(max_examples=2, deadline=None)
 @given(seed=st.integers(0, 19), single=st.booleans(), part=st.integers(0, 2))
 def test_patches_of_damaged_meshes_keep_their_shapes(kind, seed, single, part):
