@@ -24,8 +24,8 @@ from .scene_intersections import SceneIntersections
 
 _ON_SIDE = 1e-5  # barycentric coordinate up to which the closest point of a face is on a side of it
 _FIRST_REACH = 0.02  # part of the size of a mesh or a surface up to which vertices are searched first
-_MOST_WORK = 1_000_000
-"""Number of vertices whose distances from surfaces are measured, over all times: some seconds of a core."""
+_MOST_WORK, _MOST_AT_ONCE, _OF_A_PAIR = 1_000_000, 4_000_000, 1_000
+"""Number of vertices whose distances are measured, over all times and at one, and as many as two meshes count for."""
 _GROWTH = 0.1
 _SAME_POINT = 1e-6  # part of an edge within which it passes through two neighbouring faces at once: at their side
 
@@ -52,16 +52,18 @@ class DepthFinder:
         x = found.x.astype(np.float64)
         x = (x - x.mean(axis=0)).astype(np.float32) if len(x) else found.x
         surfaces: dict[int, _Surface] = {}
-        inside = np.zeros(len(found), dtype=bool)
-        inside[found.inside_rows] = True
+        inside = np.arange(len(found))[found.inside_rows]
+        crossing = np.delete(np.arange(len(found)), inside)
+        crossing = crossing[np.argsort(found.meshes[crossing, 1], kind="stable")]  # by the outer mesh
+        outer_of_crossing = found.meshes[crossing, 1]
         behind: dict[tuple[int, int], list[_Depth]] = {}
         for mesh, outer in np.unique(found.meshes, axis=0).tolist():
             shape = self._shape(mesh)
             if outer not in surfaces:
                 surfaces[outer] = _Surface(self._shape(outer), x)
             surface = surfaces[outer]
-            rows = np.flatnonzero((found.meshes[:, 1] == outer) & ~inside)
-            parts = found.vertices[(found.meshes == (mesh, outer)).all(axis=1) & inside]
+            rows = crossing[slice(*np.searchsorted(outer_of_crossing, (outer, outer + 1)))]
+            parts = found.vertices[inside[(found.meshes[inside] == (mesh, outer)).all(axis=1)]]
             crossings = _Crossings(shape, found, rows)
             found_here = behind.setdefault((min(mesh, outer), max(mesh, outer)), [])
             found_here.append(_depth_of_parts(shape, surface, x, parts))
@@ -86,7 +88,8 @@ class DepthRecorder:
     """Measures the depths at the times of a replay.
 
     These are all times until that has taken :data:`_MOST_WORK`, which few scenes take; then those at which more edges
-    pass through faces than at any before, by a share of :data:`_GROWTH`.
+    pass through faces than at any before, by a share of :data:`_GROWTH`. A time that would take more than
+    :data:`_MOST_AT_ONCE` is left out, as where thousands of pairs of meshes intersect.
     """
 
     def __init__(self):
@@ -112,9 +115,11 @@ class DepthRecorder:
     def _measure(self, found: SceneIntersections) -> None:
         if self._work > _MOST_WORK and len(found) <= (1.0 + _GROWTH) * self._most:
             return
-        meshes = found.segment.meshes
-        self._most = max(self._most, len(found))
-        self._work += sum(len(meshes[mesh].points) for mesh in np.unique(found.meshes, axis=0)[:, 0].tolist())
+        meshes, inner = found.segment.meshes, np.unique(found.meshes, axis=0)[:, 0].tolist()
+        work = sum(_OF_A_PAIR + len(meshes[mesh].points) for mesh in inner)
+        if work > _MOST_AT_ONCE:
+            return
+        self._most, self._work = max(self._most, len(found)), self._work + work
         for names, depth in self._finder.find(found).items():
             if depth > self._largest.get(names, (-1.0, 0.0))[0]:
                 self._largest[names] = depth, found.time
