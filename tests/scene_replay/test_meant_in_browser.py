@@ -4,7 +4,6 @@ import json
 import re
 
 import pytest
-from chromium import CHROMIUM, Browser
 from replay_files import Page, replay
 from usd_stages import resting_stage
 
@@ -14,14 +13,6 @@ pytestmark = pytest.mark.browser
 
 FLOOR, FALLS, RESTS = "/World/Floor", "/World/Falling", "/World/Resting"
 REASON = 'stands <b>in</b> it, "by design" \u2014 \u00fc'
-
-
-@pytest.fixture
-def browser(tmp_path):
-    if CHROMIUM is None:
-        pytest.skip("no Chromium here")
-    with Browser(tmp_path / "profile", height=900) as opened:
-        yield opened
 
 
 def text(browser, selector):

@@ -7,20 +7,11 @@ import json
 import matplotlib.image
 import numpy as np
 import pytest
-from chromium import CHROMIUM, Browser
 from pxr import Gf, UsdGeom
 from replay_files import Page, falling_through_quads, many_hits, near_and_inside_stage, replay
 from usd_stages import FALLING, add_mesh, falling, floor_stage, moved, new_stage
 
 pytestmark = pytest.mark.browser
-
-
-@pytest.fixture
-def browser(tmp_path):
-    if CHROMIUM is None:
-        pytest.skip("no Chromium here")
-    with Browser(tmp_path / "profile", height=900) as opened:
-        yield opened
 
 
 def picture(browser, folder):

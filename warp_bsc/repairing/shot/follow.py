@@ -15,7 +15,7 @@ from ..contacts import Contacts, as_contacts, projected
 from ..elastic import Springs
 from ..surface import Surface
 from .follow_kernels import find_directions, normalize, smooth
-from .stretch import ShotFrame
+from .stretch import SHORTEST_EDGE, ShotFrame
 
 if TYPE_CHECKING:
     from .playback import Playback
@@ -46,8 +46,6 @@ _RELAXATIONS, _RELAXING_SWEEPS, _MOMENTUM = 12, 40, 0.8
 """Detections, sweeps of the springs before each, and the momentum of these."""
 _RINGS = 10
 """Edges around displaced vertices within which springs move others."""
-_LEAST_LENGTH = 1e-3
-"""Length of an edge, as a share of the median, below which any change of its length is small."""
 _TIMES = 9
 """Times from a contact on an arc on at which it is looked how far the elements would pass through each other."""
 
@@ -212,7 +210,7 @@ class Follower:
     def _strain(self, x: np.ndarray, given: np.ndarray) -> float:
         """Returns the largest share by which an edge is longer than in given positions, or shorter."""
         lengths = [np.linalg.norm(y[self.edges[:, 1]] - y[self.edges[:, 0]], axis=1) for y in (x, given)]
-        length, rest = (np.maximum(values, _LEAST_LENGTH * self.length) for values in lengths)
+        length, rest = (np.maximum(values, SHORTEST_EDGE * self.length) for values in lengths)
         return float(np.maximum(length / rest, rest / length).max(initial=1.0)) - 1.0
 
     def near(self, contacts: Contacts, x: np.ndarray) -> Contacts:

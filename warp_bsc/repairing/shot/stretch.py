@@ -10,7 +10,7 @@ from ..contacts import Contacts
 _GOOD_EDGES = 1.0 / 3.0, 2.0
 """Smallest and largest length of an edge in a frame that is good, as shares of its length in the shot."""
 
-_SHORTEST_EDGE = 1e-3
+SHORTEST_EDGE = 1e-3
 """Length of an edge in the shot, as a share of the median one, up to which it does not count: when it moves at all, it
 is shorter or longer by any factor."""
 
@@ -148,7 +148,7 @@ class StretchRecorder:
         self._sum, self._count = self._sum + float(moves.sum(dtype=np.float64)), self._count + len(moves)
         edges = self._mesh.edges
         lengths = [np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1) for x in (frame.x, frame.given)]
-        counts = lengths[1] > _SHORTEST_EDGE * self._mesh.length
+        counts = lengths[1] > SHORTEST_EDGE * self._mesh.length
         ratio = lengths[0][counts] / lengths[1][counts]
         self._ratios.append((float(ratio.min(initial=1.0)), float(ratio.max(initial=1.0))))
 
