@@ -19,7 +19,7 @@ EXTRA = ("sphinx", "myst_parser", "pydata_sphinx_theme", "sphinx_copybutton")
 needs_extra = pytest.mark.skipif(
     not all(map(importlib.util.find_spec, EXTRA)), reason="needs the extra docs: pip install -e '.[docs]'"
 )
-LINK = re.compile(r"\]\(([^)\s]+)\)")
+LINK = re.compile(r"(?:\]\(|^\[[\w-]+\]: )([^)\s]+)", re.MULTILINE)  # in the text, or defined at the end
 OURS = re.compile(r"https://(?:github\.com/warp-bsc/warp-bsc/blob|raw\.githubusercontent\.com/warp-bsc/warp-bsc)/main/")
 FENCE = re.compile(r"^```.*?^```", re.DOTALL | re.MULTILINE)
 
