@@ -81,7 +81,7 @@ html_theme_options = {
     "check_switcher": False,  # a build reads nothing from the network
     "show_toc_level": 2,
     "show_prev_next": False,
-    "header_links_before_dropdown": 7,
+    "header_links_before_dropdown": 5,
     "footer_start": ["copyright"],
     "footer_end": [],
     "pygments_light_style": "a11y-high-contrast-light",

@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-
 from warp_bsc.bench.measure import given_queries as given
 from warp_bsc.bench.measure.detector import phase_columns
 from warp_bsc.bench.measure.penetration import SIMULATORS
