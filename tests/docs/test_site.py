@@ -146,7 +146,7 @@ LONGEST = 132
 
 
 def lines_that_can_be_broken(text):
-    """Yields the lines of a page and their numbers, without tables, headings, pictures, links, and what programs write."""
+    """Yields the lines of a page and their numbers, without tables, headings, pictures, links and what is generated."""
     text = re.sub(r"<!-- table: .*?<!-- end -->", lambda made: "\n" * made[0].count("\n"), text, flags=re.DOTALL)
     for number, line in enumerate(text.split("\n"), 1):
         words = re.sub(r"\[[^\]]*\]\(\S+\)", "", line.strip(" -*")).strip()
