@@ -170,7 +170,8 @@ def markdown_of(name):
         path = (DOCS / included[1]).resolve()
         text = path.read_text(encoding="utf-8")
     text = re.sub(r"```\{toctree\}\n.*?```\n", "", text, flags=re.DOTALL).rstrip() + "\n"
-    return with_links(text, path.parent, r"!?\[[^\]]*\]")
+    text = with_links(text, path.parent, r"!?\[[^\]]*\]")
+    return re.sub(r"\]\(([\w./-]+)\.rst\b", r"](\1.html", text)  # the reference has no Markdown
 
 
 def first_sentence(page):
