@@ -29,7 +29,7 @@ inner = newton.solvers.SolverVBD(builder.finalize())
 BEFORE = {
     "newton/contacts.md": CLOTH,
     "newton/reports.md": CLOTH,
-    "usd/replay.md": "import json\nimport numpy as np\n",
+    "usd/files.md": "import json\nimport numpy as np\n",
     "usd/programs.md": f"import warp_bsc as bsc\nfrom pxr import Usd\nstage = Usd.Stage.Open({str(SCENE)!r})\n",
 }
 """What the code of a page takes for granted."""
@@ -189,11 +189,21 @@ def test_commands_of_mesh_files(tmp_path, capsys, monkeypatch):
         capsys.readouterr()
 
 
-def test_replay(tmp_path, capsys, monkeypatch):
+def test_index(tmp_path, capsys):
+    names, output = run("index.md", tmp_path, capsys)
+    np.testing.assert_allclose(names["c"].vertex_face_toi, [0.25, 0.5, 0.5], atol=2.0**-20)
+    assert output.startswith("[[3, 0], [4, 0], [5, 0]] [0.2") and output.endswith(" True\n")
+
+
+def test_files(tmp_path, capsys, monkeypatch):
+    """And the page of the command, which shows what it prints."""
     monkeypatch.chdir(tmp_path)
     assert main(["replay", str(SCENE), "--json", "hits.json", "--npz", "hits.npz", "--device", "cpu"]) == 0
-    capsys.readouterr()
-    names, output = run("usd/replay.md", tmp_path, capsys)
+    printed = " ".join(capsys.readouterr().out.split())
+    shown = re.search(r"```\n(Broken: .*?)\n\.\.\.\n", (DOCS / "usd" / "replay.md").read_text(), re.DOTALL)[1]
+    parts = re.split(r"\n(?=Collisions in|The first at|Intersections at|Frames )", shown)
+    assert len(parts) == 5 and all(" ".join(part.split()) in printed for part in parts)
+    names, output = run("usd/files.md", tmp_path, capsys)
     assert names["counts"].sum() == output.count("\n") == 33 and len(names["counts"]) == 14
 
 
