@@ -94,6 +94,17 @@ def test_newton(tmp_path, capsys):
     assert re.fullmatch(r"10 0\n10 0\nPenetrated\(passed=\d+, crossed=0, inside=\d+, steps=[01]\)\n", output)
 
 
+def test_gripper(tmp_path, capsys):
+    """The cloth hangs from the fingers, which carry its weight by friction."""
+    names, output = run("newton/gripper.md", tmp_path, capsys)
+    lowest, weight = map(float, output.split("\n")[0].split())
+    forces = names["forces"]
+    assert 0.05 < lowest < 0.065 and abs(forces[:, 2].sum() + weight) < 0.02 * weight
+    assert (0.8 * np.abs(forces[:, 0]) > np.abs(forces[:, 2])).all()
+    report = names["solver"].report
+    assert not report.penetrated and report.totals.uncertified_steps == 0
+
+
 def test_from_vbd(tmp_path, capsys):
     names, _ = run("newton/from_vbd.md", tmp_path, capsys)
     assert names["solver"].report.totals.steps == 1 and names["solver"].report.certified
