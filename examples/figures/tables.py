@@ -22,7 +22,7 @@ from warp_bsc.bench.measure.penetration import SCENES
 from warp_bsc.bench.measure.repair import FILE, KNOWN_MESH
 
 ROOT = Path(__file__).resolve().parents[2]
-_GUIDES = "configuration", "contacts", "gradients", "reports", "turning_bodies"
+_GUIDES = "contacts", "gradients", "reports", "turning_bodies"
 PAGES = [
     ROOT / "README.md",
     ROOT / "docs" / "index.md",
