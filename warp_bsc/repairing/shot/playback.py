@@ -47,7 +47,7 @@ class Playback:
         self._given.target = target
         self._stage.reset(self._start)
         with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "contacts strained")  # which the spreading mends
+            warnings.filterwarnings("ignore", "a step strained an edge")  # which springs relax
             warnings.filterwarnings("ignore", "edges pass through")  # of a first frame that could not be freed
             self._stage.step(self._start, self._end, None, None, 1.0)
             certified = self._stage.report.certified  # which warns as a step does
