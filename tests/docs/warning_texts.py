@@ -95,7 +95,7 @@ def given_texts(node):
 def warning_texts():
     """The texts of all warnings and notes, of three words or more, with the module of each."""
     found = set()
-    says = re.compile(rf"warn_caller|\bonce\(|SceneTimes|{'|'.join(LISTS)}")
+    says = re.compile(rf"warn_caller|\bonce\(|SceneTimes|\b({'|'.join(LISTS)})\b")
     for path in (path for path, source in sources().items() if path not in REMARKS and says.search(source)):
         for value in (value for node in ast.walk(tree(path)) for value in given_texts(node)):
             found |= {(path, text) for text in texts(path, value) if len(text.replace("...", " ").split()) > 2}
