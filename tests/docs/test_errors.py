@@ -37,8 +37,15 @@ def test_each_entry_is_a_message_of_the_package(fragments):
 
 @pytest.mark.parametrize(
     "text",
-    ["a step strained an edge by more than", "a linear solve of a gradient did not converge", "take no part: faces"]
-    + ["flattened into", "invisible prims are not checked", "polygons are checked as fans", "draws contacts only if"],
+    [
+        "a step strained an edge by more than",
+        "a linear solve of a gradient did not converge",
+        "take no part: faces",
+        "flattened into",
+        "invisible prims are not checked",
+        "polygons are checked as fans",
+        "draws contacts only if",
+    ],
 )
 def test_the_sources_are_scanned_for_each_way_to_warn(text):
     """A call with a constant, one of a function, methods of a report, lists of notes."""

@@ -20,8 +20,8 @@ TITLE = f"""# Tutorial
 
 [![Open in Colab]({BADGE})]({COLAB}{NOTEBOOK.relative_to(ROOT).as_posix()})
 
-This notebook has the pages of the [tutorial]({SITE}tutorial.html), which `python tests/support/tutorial_notebook.py` makes it of. Each page runs alone. The next cell
-installs warp-bsc where it is missing, as on Colab."""
+These are the pages of the [tutorial]({SITE}tutorial.html), of which `python tests/support/tutorial_notebook.py` makes
+this notebook. Each page runs alone. The next cell installs warp-bsc where it is missing, as on Colab."""
 DEVICE = 'DEVICE = None  # "cpu" or "cuda:0"; None: a GPU, if there is one'
 SETTINGS = """import warp as wp
 
