@@ -52,6 +52,7 @@ def run(page, folder, capsys):
 
 CODE = [page for page in PAGES if blocks_of(page)[0]]
 TUTORIAL = [page for page in CODE if page.startswith("tutorial/")]
+LONG = (pytest.mark.slow,)
 
 
 def test_detector(tmp_path, capsys):
@@ -91,7 +92,7 @@ def test_kernels(tmp_path, capsys):
     np.testing.assert_allclose(names["x1"].grad.numpy()[0], [0.0, 0.0, 0.25], atol=1e-6)
 
 
-@pytest.mark.parametrize("page", TUTORIAL)
+@pytest.mark.parametrize("page", [pytest.param(page, marks=LONG * ("4_" in page or "5_" in page)) for page in TUTORIAL])
 @pytest.mark.filterwarnings("ignore:a step is not certified", "ignore:edges pass through faces")
 def test_tutorial(page, tmp_path, capsys):
     """Each block ends with something that it prints, and what it prints stands beside or below."""
