@@ -21,6 +21,7 @@ ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "examples" / "notebooks"
 COLAB = "https://colab.research.google.com/github/warp-bsc/warp-bsc/blob/main/"
 BADGE = "https://colab.research.google.com/assets/colab-badge.svg"
+OTHERS = {BADGE, "https://github.com/newton-physics/newton", "https://github.com/NVIDIA/warp"}
 RAW = "https://raw.githubusercontent.com/warp-bsc/warp-bsc/main/"
 SITE = "https://warp-bsc.github.io/warp-bsc/main/"
 SETUP = f"""
@@ -163,8 +164,9 @@ def test_links(path):
         if link.startswith(SITE):
             target = ROOT / "docs" / link.removeprefix(SITE).partition("#")[0].replace(".html", ".md")
         else:
-            target = ROOT / link.removeprefix(COLAB) if link.startswith(COLAB) else FOLDER / link
-        if not (target.exists() or link == BADGE):
+            start = next((start for start in (COLAB, RAW) if link.startswith(start)), None)
+            target = FOLDER / link if start is None else ROOT / link.removeprefix(start)
+        if not (target.exists() or link in OTHERS):
             wrong.append(link)
     assert len(links) > 3 and not wrong
     assert all((ROOT / name).exists() for name in re.findall(rf"{RAW}([\w./]+)", text))
