@@ -27,6 +27,7 @@ SETTINGS = """import warp as wp
 
 wp.config.log_level = wp.LOG_WARNING  # no line for each module of kernels
 wp.set_device(DEVICE or wp.get_preferred_device())"""
+PYTHON = re.compile(r"```python\n(.*?)\n```", re.DOTALL)
 LINK = re.compile(r"(!?\[[^\]]*\]\()(?!\w+:)([^)#]+)(#[^)]*)?\)")
 NEXT = re.compile(r"\n\nNext: .*", re.DOTALL)
 
@@ -51,7 +52,7 @@ def cells():
         number = count()
         for part in re.split(r"(```python\n.*?```)", NEXT.sub("", page.read_text().strip()), flags=re.DOTALL):
             name = f"{page.stem.partition('_')[2]}_{chr(ord('a') + next(number))}"
-            code = re.fullmatch(r"```python\n(.*?)\n```", part, re.DOTALL)
+            code = PYTHON.fullmatch(part)
             if code:
                 yield f"{name}_code", code[1]
             elif part.strip():
