@@ -51,6 +51,8 @@ def run(page, folder, capsys):
 
 
 CODE = [page for page in PAGES if blocks_of(page)[0]]
+TUTORIAL = [page for page in CODE if page.startswith("tutorial/")]
+LONG = (pytest.mark.slow,)
 
 
 def test_detector(tmp_path, capsys):
@@ -85,6 +87,17 @@ def test_kernels(tmp_path, capsys):
     assert names["count"].numpy().tolist() == [1] and output.startswith("[1]\n")
     assert 0.5 - 2.0**-20 <= names["first"].numpy()[0] <= 0.5 and (names["first"].numpy()[1:] == 2.0).all()
     np.testing.assert_allclose(names["x1"].grad.numpy()[0], [0.0, 0.0, 0.25], atol=1e-6)
+
+
+@pytest.mark.parametrize("page", [pytest.param(page, marks=LONG * ("4_" in page or "5_" in page)) for page in TUTORIAL])
+@pytest.mark.filterwarnings("ignore:a step is not certified", "ignore:edges pass through faces")
+def test_tutorial(page, tmp_path, capsys):
+    """Each block ends with something that it prints, and what it prints stands beside or below."""
+    blocks = blocks_of(page)[0]
+    assert len(blocks) > 1 and all(re.search(r"\bprint\(.*(  #|\n#) .*\n\Z", block) for block in blocks)
+    _, output = run(page, tmp_path, capsys)
+    shown = re.findall(r"\bprint\(.*(?:  |\n)# (.*)$", "\n".join(blocks), re.MULTILINE)
+    assert output.splitlines() == shown
 
 
 def test_newton(tmp_path, capsys):
@@ -230,6 +243,6 @@ def test_programs(tmp_path, capsys):
 
 def test_each_page_with_code_has_a_test_and_each_block_that_does_not_run_a_reason():
     tests = {name.removeprefix("test_") for name in globals() if name.startswith("test_")}
-    assert {Path(page).stem for page in CODE} <= tests
+    assert len(TUTORIAL) == 7 and {Path(page).stem for page in set(CODE) - set(TUTORIAL)} <= tests
     reasons = [reason for page in PAGES for reason in blocks_of(page)[1]]
     assert reasons and all(len(reason.split()) > 3 for reason in reasons)

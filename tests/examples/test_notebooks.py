@@ -14,12 +14,14 @@ import warp as wp
 
 nbformat = pytest.importorskip("nbformat", reason="needs the extra dev: pip install -e '.[dev]'")
 nbclient = pytest.importorskip("nbclient", reason="needs the extra dev: pip install -e '.[dev]'")
-from clean_notebooks import NOTEBOOKS, committed_form  # noqa: E402 (needs nbformat)
+import tutorial_notebook  # noqa: E402 (needs nbformat)
+from clean_notebooks import NOTEBOOKS, committed_form  # noqa: E402
 
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "examples" / "notebooks"
 COLAB = "https://colab.research.google.com/github/warp-bsc/warp-bsc/blob/main/"
 BADGE = "https://colab.research.google.com/assets/colab-badge.svg"
+OTHERS = {BADGE, "https://github.com/newton-physics/newton", "https://github.com/NVIDIA/warp"}
 RAW = "https://raw.githubusercontent.com/warp-bsc/warp-bsc/main/"
 SITE = "https://warp-bsc.github.io/warp-bsc/main/"
 SETUP = f"""
@@ -113,8 +115,20 @@ def test_repair_and_replay(monkeypatch):
     assert ["Repair of cloth_twist.usd" in page for page in pages] == [False, True]
 
 
+@pytest.mark.slow
+def test_tutorial(monkeypatch):
+    """Its code is that of pages, whose outputs tests/docs/test_code.py compares."""
+    _, text, _, _ = execute("tutorial", repr(str(wp.get_device())), ["solver.report.certified"], monkeypatch)
+    assert "30 0\n" in text and "72 0 True\n" in text
+
+
+def test_the_notebook_of_the_tutorial_is_made_of_its_pages():
+    is_same = tutorial_notebook.NOTEBOOK.read_text(encoding="utf-8") == tutorial_notebook.notebook_text()
+    assert is_same, "python tests/support/tutorial_notebook.py writes it"
+
+
 def test_each_notebook_has_a_test():
-    assert {f"test_{path.stem}" for path in NOTEBOOKS} <= globals().keys() and len(NOTEBOOKS) == 3
+    assert {f"test_{path.stem}" for path in NOTEBOOKS} <= globals().keys() and len(NOTEBOOKS) == 4
 
 
 @each_notebook
@@ -148,10 +162,11 @@ def test_links(path):
     wrong, links = [], re.findall(r"\]\(([^)]+)\)", text)
     for link in links:
         if link.startswith(SITE):
-            target = ROOT / "docs" / link.removeprefix(SITE).replace(".html", ".md")
+            target = ROOT / "docs" / link.removeprefix(SITE).partition("#")[0].replace(".html", ".md")
         else:
-            target = ROOT / link.removeprefix(COLAB) if link.startswith(COLAB) else FOLDER / link
-        if not (target.exists() or link == BADGE):
+            start = next((start for start in (COLAB, RAW) if link.startswith(start)), None)
+            target = FOLDER / link if start is None else ROOT / link.removeprefix(start)
+        if not (target.exists() or link in OTHERS):
             wrong.append(link)
     assert len(links) > 3 and not wrong
     assert all((ROOT / name).exists() for name in re.findall(rf"{RAW}([\w./]+)", text))
