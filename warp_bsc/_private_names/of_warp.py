@@ -75,6 +75,32 @@ def on_compilation(report: Callable[[bool], None]) -> None:
     module._run_codegen = reported
 
 
+def on_failed_allocation(explain: Callable[[wp.Device, tuple[int, ...], type], Exception | None]) -> None:
+    """Has a function return the error to raise, None for Warp's, where Warp cannot allocate an array.
+
+    The function is called with the array's device, shape and type.
+
+    Contract: ``warp.array._init_new(dtype, shape, strides, device, pinned)`` allocates each array, and raises a
+    RuntimeError that begins with "Failed to allocate". Where that name is gone, Warp's error remains.
+    """
+    allocate = getattr(wp.array, "_init_new", None)
+    if allocate is None:
+        return
+
+    @functools.wraps(allocate)
+    def explained(self: Any, dtype: type, shape: tuple[int, ...], strides: Any, device: wp.DeviceLike, pinned: bool) -> None:
+        try:
+            allocate(self, dtype, shape, strides, device, pinned)
+        except (RuntimeError, MemoryError) as error:
+            failed = isinstance(error, MemoryError) or str(error).startswith("Failed to allocate")
+            better = explain(wp.get_device(device), shape, dtype) if failed else None
+            if better is None:
+                raise
+            raise better from error
+
+    wp.array._init_new = explained
+
+
 @functools.cache
 def warn_of_one_thread() -> None:
     warn_caller(

@@ -18,7 +18,7 @@ from typing import Any, ParamSpec, Protocol, TypeVar
 import warp as wp
 
 from ..._private_names.of_warp import may_run_in_threads
-from . import compilation  # noqa: F401 (says so where kernels are compiled)
+from . import compilation, memory  # noqa: F401 (both say so: where kernels are compiled, where memory is short)
 
 _THREADS = os.cpu_count() or 1
 
