@@ -88,7 +88,9 @@ def on_failed_allocation(explain: Callable[[wp.Device, tuple[int, ...], type], E
         return
 
     @functools.wraps(allocate)
-    def explained(self: Any, dtype: type, shape: tuple[int, ...], strides: Any, device: wp.DeviceLike, pinned: bool) -> None:
+    def explained(
+        self: Any, dtype: type, shape: tuple[int, ...], strides: Any, device: wp.DeviceLike, pinned: bool
+    ) -> None:
         try:
             allocate(self, dtype, shape, strides, device, pinned)
         except (RuntimeError, MemoryError) as error:

@@ -24,7 +24,8 @@ from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from typing import Any
 
-from .._arguments import given
+from .._arguments import checked_integer, given
+from ..detection.run.start import device_names
 from ..usd.scene import Scene
 from ..usd.selection import Selection
 from .checking import Checks
@@ -236,6 +237,23 @@ def checked_address(address: str) -> str:
     return address
 
 
+def checked_workers(workers: Any, devices: str | None) -> int | str:
+    """Returns a number of processes, by default that of the devices, or the address of a scheduler.
+
+    Raises:
+        TypeError: If it is something else.
+        ValueError: If it is no such address, less than the number of devices, or a cluster is to use several.
+    """
+    count = len(device_names(devices))
+    if not isinstance(workers, str):
+        return checked_integer(count if workers is None else workers, "workers", count)
+    if count > 1:
+        raise ValueError(
+            f"device must be one for a cluster, such as cuda, of which each worker has its own, not {devices}"
+        )
+    return checked_address(workers)
+
+
 def device_of_cluster(address: str, name: str | None) -> str:
     """Returns the name of the Warp device that a worker of a cluster uses.
 
@@ -248,7 +266,7 @@ def device_of_cluster(address: str, name: str | None) -> str:
         OSError: As of :class:`Cluster`.
         ValueError: If a worker has no such device.
     """
-    cluster = Cluster(address)
+    cluster = Cluster(str(checked_workers(address, name)))
     try:
         return cluster.result(cluster.submit(name_device, name))
     finally:

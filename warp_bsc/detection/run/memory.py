@@ -42,8 +42,12 @@ def _amount(size: float) -> str:
 
 def explain(device: wp.Device, shape: tuple[int, ...], dtype: type) -> DeviceMemoryError | None:
     """Returns the error of an array that could not be allocated, None if nothing in this package allocates it."""
-    stack = [(Path(frame.f_code.co_filename), frame.f_code.co_qualname, line) for frame, line in traceback.walk_stack(None)]
-    own = [place for place in stack if _PACKAGE in place[0].parents and place[0].name not in ("memory.py", "of_warp.py")]
+    stack = [
+        (Path(frame.f_code.co_filename), frame.f_code.co_qualname, line) for frame, line in traceback.walk_stack(None)
+    ]
+    own = [
+        place for place in stack if _PACKAGE in place[0].parents and place[0].name not in ("memory.py", "of_warp.py")
+    ]
     if not own:
         return None
     file, function, line = own[0][0], own[0][1].partition(".<locals>")[0], own[0][2]

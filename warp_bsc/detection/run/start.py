@@ -2,6 +2,7 @@
 
 import os
 import sys
+from collections.abc import Sequence
 
 import warp as wp
 
@@ -35,6 +36,11 @@ def checked_device(device: wp.DeviceLike) -> wp.Device:
         return wp.get_device(device)
     except (RuntimeError, ValueError) as error:
         raise ValueError(f"device must be one of this machine, not {device!r}: {error}") from None
+
+
+def device_names(names: str | None) -> Sequence[str | None]:
+    """Returns the names of devices between commas; None for Warp's default."""
+    return [None] if names is None else names.split(",")
 
 
 def find_device(name: str | None) -> wp.Device:
