@@ -23,12 +23,8 @@ def cpu_graph() -> Any:
             cannot be captured on the CPU. Graphs on CUDA do not need it.
     """
     warn_if_untested("warp")
-    try:
-        graph = wp._src.context.runtime._apic_graph
-        is_known = isinstance(graph.apic, bool)
-    except AttributeError:
-        is_known = False
-    if not is_known:
+    graph = getattr(wp._src.context.runtime, "_apic_graph", None)
+    if not isinstance(getattr(graph, "apic", None), bool):
         raise RuntimeError(f"Warp {wp.__version__} does not say which graph the CPU captures: run this outside graphs")
     return graph
 
@@ -75,32 +71,14 @@ def on_compilation(report: Callable[[bool], None]) -> None:
     module._run_codegen = reported
 
 
-def on_failed_allocation(explain: Callable[[wp.Device, tuple[int, ...], type], Exception | None]) -> None:
-    """Has a function return the error to raise, None for Warp's, where Warp cannot allocate an array.
+def replace_allocation(replace: Callable[[Callable[..., None]], Callable[..., None]]) -> None:
+    """Replaces the function that allocates an array by what another one makes of it.
 
-    The function is called with the array's device, shape and type.
-
-    Contract: ``warp.array._init_new(dtype, shape, strides, device, pinned)`` allocates each array, and raises a
-    RuntimeError that begins with "Failed to allocate". Where that name is gone, Warp's error remains.
+    Contract: ``warp.array._init_new(self, dtype, shape, strides, device, pinned)`` allocates each array; where there is
+    no memory, it raises a RuntimeError that begins with "Failed to allocate". Where it is gone, nothing is replaced.
     """
-    allocate = getattr(wp.array, "_init_new", None)
-    if allocate is None:
-        return
-
-    @functools.wraps(allocate)
-    def explained(
-        self: Any, dtype: type, shape: tuple[int, ...], strides: Any, device: wp.DeviceLike, pinned: bool
-    ) -> None:
-        try:
-            allocate(self, dtype, shape, strides, device, pinned)
-        except (RuntimeError, MemoryError) as error:
-            failed = isinstance(error, MemoryError) or str(error).startswith("Failed to allocate")
-            better = explain(wp.get_device(device), shape, dtype) if failed else None
-            if better is None:
-                raise
-            raise better from error
-
-    wp.array._init_new = explained
+    if hasattr(wp.array, "_init_new"):
+        wp.array._init_new = replace(wp.array._init_new)
 
 
 @functools.cache
@@ -121,10 +99,10 @@ def paused_tape() -> Iterator[wp.Tape | None]:
         RuntimeError: If this version of Warp has no such name: a tape would record kernels of the stage, and gradients
             would be wrong.
     """
-    try:
-        tape = wp._src.context.runtime.tape
-    except AttributeError:
-        raise missing("warp", "context.runtime.tape", "a step cannot pause the active tape") from None
+    runtime = wp._src.context.runtime
+    if not hasattr(runtime, "tape"):
+        raise missing("warp", "context.runtime.tape", "a step cannot pause the active tape")
+    tape = runtime.tape
     if tape is None:
         yield None
         return
@@ -170,7 +148,6 @@ def struct_fields(struct: Any) -> list[str]:
     Raises:
         RuntimeError: If it does not.
     """
-    try:
-        return list(struct.vars)
-    except AttributeError:
-        raise missing("warp", "attribute vars of structs", "the stage cannot be constructed") from None
+    if not hasattr(struct, "vars"):
+        raise missing("warp", "attribute vars of structs", "the stage cannot be constructed")
+    return list(struct.vars)

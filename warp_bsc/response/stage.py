@@ -11,12 +11,13 @@ from newton.solvers.experimental.coupled import SolverCoupled
 
 from .._arguments import checked_number
 from .._one_thread import one_at_a_time
-from .._private_names.of_newton import SHAPES_CHANGE
+from .._private_names.of_newton import SHAPES_CHANGE, body_q_prev
 from .._private_names.of_warp import paused_tape
 from .._warnings import warn_caller
 from .drive.coupled_check import CoupledCheck, has_elements_of_other_entries, unseen_shapes
 from .drive.coupling import CouplingHooks
 from .drive.inner_steps import InnerSteps, StepCall
+from .drive.snapshot import Snapshot
 from .drive.world_mask import WorldMask, checked_mask
 from .report.count_steps import count_step, merge_step, note_crossings
 from .report.count_worlds import WorldCounter
@@ -42,6 +43,7 @@ class CollisionStage(CouplingHooks):
     _keeps_strands = False  # apart by the radii of the model, without arguments
     _counter: WorldCounter | None = None  # of results by world, if the report is asked for them
     _inner: InnerSteps  # how the inner solver takes a step
+    _start: Snapshot | None = None  # what a step that fails puts back
 
     def _allocate(
         self,
@@ -134,16 +136,38 @@ class CollisionStage(CouplingHooks):
             NotImplementedError: If a tape is active and the model requires gradients, and the step carries none: that
                 of a :class:`.solver_ccd.SolverCCD`, or of a part of the worlds.
             RuntimeError: If another thread is using this stage, or if the first ``world_mask`` is given in a graph.
+            MemoryError: If the memory of the device does not suffice. After an error, ``state_in`` and the report are
+                as before, and the step can be taken again; another ``state_out`` holds nothing.
         """
         call = self._checked_call(state_in, state_out, control, contacts, dt, world_mask, options)
-        for step in self._inner.parts(call):  # the step itself, or its substeps
-            with self._entered(step):  # keeps its start, and whatever the inner solver must not change
-                self._inner.take(step)  # the inner solver predicts its end
-                with paused_tape():
-                    self._leave_out(step)  # worlds that take no part
-                    self._resolve(step)  # detects the contacts of the motion, and resolves them
+        with self._restored_on_error(state_in):
+            for step in self._inner.parts(call):  # the step itself, or its substeps
+                with self._entered(step):  # keeps its start, and whatever the inner solver must not change
+                    self._inner.take(step)  # the inner solver predicts its end
+                    with paused_tape():
+                        self._leave_out(step)  # worlds that take no part
+                        self._resolve(step)  # detects the contacts of the motion, and resolves them
         if not self.mesh.device.is_capturing:
             self.report.warn()
+
+    @contextlib.contextmanager
+    def _restored_on_error(self, state):
+        """Restores the state at the start of a step, and the results of the last one, if the step fails.
+
+        Some solvers write to that state. A graph whose capture fails is never launched.
+        """
+        if self.mesh.device.is_capturing:
+            yield
+            return
+        kept = [*vars(state).values(), *self._motion.last.arrays, body_q_prev(self.solver), *self.report.arrays]
+        with paused_tape():
+            start = self._start = Snapshot([x for x in kept if isinstance(x, wp.array) and x.size], self._start)
+        try:
+            yield
+        except Exception:
+            with paused_tape():
+                start.restore()
+            raise
 
     def _checked_call(self, state_in, state_out, control, contacts, dt, world_mask, options):
         """Returns the arguments of a step, checked, with the active tape if the model requires gradients."""

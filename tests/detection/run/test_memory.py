@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import warp as wp
 from collision_results import FIELDS
 from failing_memory import fail_each
 

@@ -1,67 +1,67 @@
 """Says what did not fit where the memory of a device is short, and what needs less."""
 
+import functools
 import linecache
 import math
 import os
 import re
 import traceback
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import warp as wp
 
-from ..._private_names.of_warp import on_failed_allocation
+from ..._private_names.of_warp import replace_allocation
 
 _PACKAGE = Path(__file__).parents[2]
 
 
 class DeviceMemoryError(MemoryError, RuntimeError):
-    """The memory of a device does not suffice. The message names the array, its size, what is free, and what needs less.
+    """The memory of a device does not suffice: for which array, of what size, what is free, and what needs less.
 
-    The call that raises it leaves states, reports and buffers as they were before it, and succeeds once there is memory.
+    The call that raises it leaves objects as they were before, and succeeds once there is memory.
     """
 
 
-def _free_bytes(device: wp.Device) -> int:
-    """Returns the free memory of a device, 0 if that is not known."""
-    if device.is_cuda:
-        return device.free_memory
-    try:
-        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, ValueError, OSError):  # not on Linux
-        return 0
-
-
-def _amount(size: float) -> str:
-    """Returns a number of bytes in words."""
-    for unit in ("bytes", "kB", "MB"):
-        if size < 1000.0:
-            return f"{size:.3g} {unit}"
-        size /= 1000.0
-    return f"{size:,.4g} GB"
-
-
-def explain(device: wp.Device, shape: tuple[int, ...], dtype: type) -> DeviceMemoryError | None:
-    """Returns the error of an array that could not be allocated, None if nothing in this package allocates it."""
-    stack = [
-        (Path(frame.f_code.co_filename), frame.f_code.co_qualname, line) for frame, line in traceback.walk_stack(None)
-    ]
-    own = [
-        place for place in stack if _PACKAGE in place[0].parents and place[0].name not in ("memory.py", "of_warp.py")
-    ]
-    if not own:
+def _explain(device: wp.Device, shape: tuple[int, ...], dtype: Any) -> DeviceMemoryError | None:
+    """Returns the error of an array for which there is no memory, None if nothing in this package allocates it."""
+    stack = [(Path(frame.f_code.co_filename), frame.f_code.co_qualname, at) for frame, at in traceback.walk_stack(None)]
+    places = [place for place in stack if _PACKAGE in place[0].parents and place[0] != Path(__file__)]
+    if not places:
         return None
-    file, function, line = own[0][0], own[0][1].partition(".<locals>")[0], own[0][2]
-    called = [name for path, name, _ in own if "cli" not in path.parts and not re.search(r"(^|\.)[_<]", name)]
+    file, function, line = places[0]
+    function = function.partition(".<locals>")[0]
+    callers = [name for path, name, _ in places if "cli" not in path.parts and not re.search(r"(^|\.)[_<]", name)]
     target, is_assignment, _ = linecache.getline(str(file), line).strip().partition(" = ")
-    count, free = math.prod(shape), _free_bytes(device)
-    size = count * wp.types.type_size_in_bytes(dtype)
-    fits = f", enough for {count * free // size:,}" if free < size else ""
+    count, size = math.prod(shape), wp.types.type_size_in_bytes(dtype)
+    free = device.free_memory if device.is_cuda else 0
+    if device.is_cpu and "SC_AVPHYS_PAGES" in getattr(os, "sysconf_names", {}):
+        free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    left = f"; {free / 1e6:,.6g} MB are free, enough for {free // size:,}" if free else ""
+    caller = callers[-1] if callers else function
+    name = f"{target} in {function}" if is_assignment else function
     return DeviceMemoryError(
-        f"out of memory on {device}: {[function, *called][-1]} needs {_amount(size)} for "
-        f"{f'{target} of ' if is_assignment else ''}{function} ({file.name}:{line}), {count:,} of "
-        f"{wp.types.type_repr(dtype)}{f'; {_amount(free)} are free{fits}' if free else ''}. Less is needed by fewer worlds, "
-        "a part of the mesh at a time, a smaller distance, or fewer processes on the device"
+        f"out of memory on {device}: {caller} needs {count * size / 1e6:,.6g} MB for {name} ({file.name}:{line}), "
+        f"{count:,} of {dtype.__name__}{left}. Less is needed by fewer worlds, a part of the mesh at a time, a smaller "
+        "distance, or fewer processes on a device"
     )
 
 
-on_failed_allocation(explain)
+def _explained(allocate: Callable[..., None]) -> Callable[..., None]:
+    """Returns Warp's function that allocates an array with another error where there is no memory."""
+
+    @functools.wraps(allocate)
+    def explained(self: wp.array, dtype: Any, shape: tuple[int, ...], strides: Any, device: Any, pinned: bool) -> None:
+        try:
+            allocate(self, dtype, shape, strides, device, pinned)
+        except (RuntimeError, MemoryError) as error:
+            is_short = isinstance(error, MemoryError) or str(error).startswith("Failed to allocate")
+            if is_short and (explanation := _explain(wp.get_device(device), shape, dtype)):
+                raise explanation from error
+            raise
+
+    return explained
+
+
+replace_allocation(_explained)

@@ -37,12 +37,20 @@ class Snapshot:
         saved: The copies, in the order of what is kept.
     """
 
-    def __init__(self, kept: Sequence[wp.array], worlds: Sequence[wp.array[int]] = ()):
+    def __init__(
+        self, kept: Sequence[wp.array], before: "Snapshot | None" = None, *, worlds: Sequence[wp.array[int]] = ()
+    ):
         """Copies arrays, as they are now; :meth:`save` copies them again, and allocates nothing.
 
+        Memory of a snapshot ``before``, which is of no use then, is used again if its arrays are of the same shapes.
         ``worlds`` has the worlds of the elements of each array, if it is ever to be restored by a mask.
         """
-        self._kept, self._worlds, self.saved = kept, worlds, [wp.clone(x, requires_grad=False) for x in kept]
+        self._kept, self._worlds = kept, worlds
+        if before is not None and [(x.shape, x.dtype) for x in kept] == [(x.shape, x.dtype) for x in before.saved]:
+            self.saved = before.saved
+            self.save()
+        else:
+            self.saved = [wp.clone(x, requires_grad=False) for x in kept]
 
     def save(self) -> None:
         """Copies what they hold."""

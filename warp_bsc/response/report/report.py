@@ -77,6 +77,12 @@ class SolverReport:
         self.coupled: Any = None  # the check of steps in the state of the program, of an entry of a coupled solver
         self.spans: list[tuple] = []  # start and end of each substep of the last step, in seconds, or events on a GPU
 
+    @property
+    def arrays(self) -> list[wp.array]:
+        """What the last step did, and the totals, as steps write them."""
+        found = self.step_results
+        return [found.results, found.of_vertices, found.of_bodies, self.last_strain, self.set_steps, self.total_values]
+
     def copy_totals(self) -> None:
         """Copies the totals to the host, without waiting for the device, also in a CUDA graph."""
         wp.copy(self._host_totals, self.total_values)
