@@ -1,9 +1,12 @@
 """Memory that does not suffice: an error that says what for, and objects that work once there is some."""
 
+import re
+
 import numpy as np
 import pytest
+import warp as wp
 from collision_results import FIELDS
-from failing_memory import fail_each
+from failing_memory import fail_each, failing_memory
 
 import warp_bsc as bsc
 
@@ -29,5 +32,28 @@ def test_a_detection_says_what_has_no_room(device, options):
         return [getattr(found, field).tobytes() for field in FIELDS]
 
     messages = fail_each(device, make, detect)
-    print("\n".join(messages[::2]), len(messages))
-    assert 0
+    queue = r"out of memory on \S+: CollisionDetector.detect needs \S+ MB for self.queue in NarrowPhase.grow \(.*\), "
+    assert [message for message in messages if re.match(queue + r"[\d,]+ of vec2i.* Less is needed by fewer", message)]
+    assert any("self.contacts, self._keys, self._order in NarrowPhase.allocate_contacts" in m for m in messages)
+
+
+def test_an_array_of_a_program_itself_fails_as_warp_says(device):
+    with failing_memory(device, 0), pytest.raises(RuntimeError, match=r"^Failed to allocate 8 bytes") as raised:
+        wp.zeros(2, dtype=int, device=device)
+    assert not isinstance(raised.value, MemoryError)
+
+
+@pytest.mark.parametrize("find", ["find_intersections", "find_proximities", "candidates", "collision_free_step"])
+def test_other_calls_of_a_detector_do_too(device, find):
+    faces, x0, x1 = flying()
+    arguments = {"find_proximities": (x0, 0.2), "find_intersections": (x0,)}.get(find, (x0, x1))
+
+    def make():
+        return bsc.CollisionDetector(bsc.CollisionMesh(faces, len(x0), device=device))
+
+    def call(detector):
+        found = getattr(detector, find)(*arguments)
+        arrays = [found] if isinstance(found, np.ndarray) else [v for v in vars(found).values() if hasattr(v, "shape")]
+        return [np.asarray(array).tobytes() for array in arrays]
+
+    assert all(f"CollisionDetector.{find} needs" in message for message in fail_each(device, make, call))

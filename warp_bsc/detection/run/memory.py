@@ -30,7 +30,8 @@ def _explain(device: wp.Device, shape: tuple[int, ...], dtype: Any) -> DeviceMem
     places = [place for place in stack if _PACKAGE in place[0].parents and place[0] != Path(__file__)]
     if not places:
         return None
-    file, function, line = places[0]
+    # a method, rather than a function that it calls to make an array
+    file, function, line = next((place for place in places if "." in place[1].partition(".<locals>")[0]), places[0])
     function = function.partition(".<locals>")[0]
     callers = [name for path, name, _ in places if "cli" not in path.parts and not re.search(r"(^|\.)[_<]", name)]
     target, is_assignment, _ = linecache.getline(str(file), line).strip().partition(" = ")
