@@ -57,18 +57,15 @@ def on_compilation(report: Callable[[bool], None]) -> None:
     compiled, and for none that is in the cache. The kernels of a module are the values of ``kernels``; ``func`` is the
     Python function of each. Where that name is gone, nothing is reported.
     """
-    module = wp._src.context.Module
-    generate = getattr(module, "_run_codegen", None)
-    if generate is None:
-        return
+    generate: Any = getattr(wp._src.context.Module, "_run_codegen", None)
 
-    @functools.wraps(generate)
     def reported(self: Any, options: dict[str, Any], is_cpu: bool) -> Any:
         if any((kernel.func.__module__ or "").startswith("warp_bsc.") for kernel in self.kernels.values()):
             report(is_cpu)
         return generate(self, options, is_cpu)
 
-    module._run_codegen = reported
+    if generate is not None:
+        wp._src.context.Module._run_codegen = functools.wraps(generate)(reported)
 
 
 def replace_allocation(replace: Callable[[Callable[..., None]], Callable[..., None]]) -> None:
@@ -113,6 +110,9 @@ def paused_tape() -> Iterator[wp.Tape | None]:
         tape.__enter__()
 
 
+_make_empty = functools.cache(lambda struct: struct())
+
+
 def struct_type(struct: Any) -> Any:
     """Returns the type of a Warp struct.
 
@@ -133,11 +133,6 @@ def empty_struct(value: Any) -> Any:
     :func:`struct_type`.
     """
     return _make_empty(struct_type(value)) if wp.types.is_struct(value) else None
-
-
-@functools.cache
-def _make_empty(struct):
-    return struct()
 
 
 def struct_fields(struct: Any) -> list[str]:

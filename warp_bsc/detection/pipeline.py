@@ -398,7 +398,7 @@ class DetectionPipeline:
         """Makes ``capacities`` anew, after a buffer was replaced."""
         capacities = self._host_capacities()
         self.capacities = wp.array(capacities.values(), dtype=wp.int64, device=self.mesh.device)
-        self._known_capacities = capacities
+        self._known_capacities = capacities  # once the device has them
 
     def _launch_count_not_finite(self, x0: wp.array, x1: wp.array) -> None:
         """Launches the count on the CPU; the broad phase of a GPU counts while it boxes the elements."""

@@ -49,7 +49,7 @@ def replay(
         scene: The scene; its selection defines the pairs that are checked.
         method: ``"float"``, ``"conservative"`` or ``"exact"``, for collisions; intersections are always exact.
         device: Warp device or its name; default: Warp's default. Several names with commas between them, such as
-            ``"cuda:0,cuda:1"``, are each for a process of its own, also one that is there twice; results are the same.
+            ``"cuda:0,cuda:1"``, are each for a process of its own, also one named twice; results are the same.
         intersections: Whether to find the intersections at each time, and the meshes that are wholly inside others.
         ignore_initial: Whether to ignore all pairs of meshes that cross at the first time, and meshes that cross
             themselves then: their collisions and intersections are only counted. For a mesh that is inside another
@@ -68,8 +68,8 @@ def replay(
             its share of the cores and, in turns, one of the named devices or, if ``device`` is ``"cuda"`` or None, one
             GPU; default: one process for each named device. With more than one process, a program must have ``if
             __name__ == "__main__":`` around its statements, as :mod:`multiprocessing` requires. The workers of a
-            cluster open the scene by the same path, need ``pip install 'warp-bsc[usd,cluster]'``, and each use the one
-            ``device`` as they see it: for a GPU each, start them with dask-cuda, or with ``CUDA_VISIBLE_DEVICES``.
+            cluster open the scene by the same path, need ``pip install 'warp-bsc[usd,cluster]'``, and each use
+            ``device``, one alone, as they see it: dask-cuda gives each a GPU, ``CUDA_VISIBLE_DEVICES`` as well.
 
     Yields:
         IntervalResult: The collisions of one interval, in order, the same for any number of workers. Only the results
@@ -112,11 +112,7 @@ def _checked_validate(validate: Any) -> int | Literal["all"]:
 
 
 def _replay(
-    scene: Scene,
-    checks: Checks,
-    ignore_initial: bool,
-    earlier: Iterable[IntervalResult],
-    workers: int | str,
+    scene: Scene, checks: Checks, ignore_initial: bool, earlier: Iterable[IntervalResult], workers: int | str
 ) -> Iterator[IntervalResult]:
     """Yields the results of :func:`replay`, whose arguments have been checked."""
     with contextlib.ExitStack() as stack:

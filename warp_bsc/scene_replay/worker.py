@@ -67,8 +67,6 @@ _opened: _Opened | None = None
 def device_of_worker(name: str | None, number: int, gpu_count: int) -> str | None:
     """Returns the name of the device that a worker on this machine uses: the named ones, or else the GPUs, in turns.
 
-    If there are more workers than devices, workers share them.
-
     Args:
         name: Names of the requested devices, with commas between them, None for Warp's default.
         number: Number of the worker, from 0.

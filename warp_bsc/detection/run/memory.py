@@ -18,10 +18,7 @@ _PACKAGE = Path(__file__).parents[2]
 
 
 class DeviceMemoryError(MemoryError, RuntimeError):
-    """The memory of a device does not suffice: for which array, of what size, what is free, and what needs less.
-
-    The call that raises it leaves objects as they were before, and succeeds once there is memory.
-    """
+    """The memory of a device does not suffice. What was called is as before, and can be called again."""
 
 
 def _explain(device: wp.Device, shape: tuple[int, ...], dtype: Any) -> DeviceMemoryError | None:

@@ -2,7 +2,6 @@
 
 import os
 import sys
-from collections.abc import Sequence
 
 import warp as wp
 
@@ -38,7 +37,7 @@ def checked_device(device: wp.DeviceLike) -> wp.Device:
         raise ValueError(f"device must be one of this machine, not {device!r}: {error}") from None
 
 
-def device_names(names: str | None) -> Sequence[str | None]:
+def device_names(names: str | None) -> list:
     """Returns the names of devices between commas; None for Warp's default."""
     return [None] if names is None else names.split(",")
 

@@ -433,11 +433,10 @@ class NewtonMethod:
         self._prepare_candidates()
 
     def _allocate_candidates(self, queues):
-        capacity = sum(len(q.pairs) for q in queues)
         self._retire(self.problem.candidates)
-        sizes: dict = dict.fromkeys(
-            ("start", "room", "near", "far", "listed_edges", "listed_others"), self._work.worlds
-        )
+        of_worlds = "start", "room", "near", "far", "listed_edges", "listed_others"
+        sizes: dict = dict.fromkeys(of_worlds, self._work.worlds)
+        capacity = sum(len(q.pairs) for q in queues)
         sizes["used"] = 1
         sizes["kept"] = capacity if self.mesh.distances is not None else 0
         self.problem.candidates = allocate(Candidates, capacity, self._work.device, **sizes)
