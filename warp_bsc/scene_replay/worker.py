@@ -156,9 +156,7 @@ def _open(job: bytes, first: int) -> _Opened:
         if version != __version__:
             raise ValueError(f"{_worker_name()}: this worker has version {__version__} of warp-bsc, not {version}")
         scene, checks = pickle.load(stream)
-        device = checks.device
-        if _local:
-            device = device_of_worker(device, _local[0], gpu_count())
+        device = device_of_worker(checks.device, _local[0], gpu_count()) if _local else checks.device
         checks = replace(checks, device=find_device(device).alias)
         _opened = _Opened(job, IntervalChecker(scene, checks, _worker_name()), len(scene.left_out))
     return _opened
