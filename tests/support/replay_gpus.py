@@ -1,9 +1,9 @@
 """Measures ``warp-bsc replay`` of one large shot on one, two and four GPUs of a machine, and prints a table.
 
 ``python tests/support/replay_gpus.py`` takes the GPUs that are there; ``--devices cpu cpu,cpu --side 60`` tries it on a
-CPU. The shot is made first: two waving sheets of together 4 side^2 triangles, whose crests pass through each other. A run
-of two intervals on each device then compiles and loads the kernels. Each measured run is a process of its own, from its
-start to its end. What runs write must be the same but for the names of devices; otherwise it is an error.
+CPU. The shot is made first: two waving sheets of together 4 side^2 triangles, whose crests pass through each other. A
+run of two intervals on each device then compiles and loads the kernels. Each measured run is a process of its own, from
+its start to its end. What runs write must be the same but for the names of devices; otherwise it is an error.
 
 Reading and checking are sums over the processes, as ``replay`` prints them. ``--each 2`` starts two processes for each
 GPU, which share it: where one process keeps its GPU waiting, for the host reads and names, they take less time.

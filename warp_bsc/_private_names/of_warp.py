@@ -74,8 +74,9 @@ def replace_allocation(replace: Callable[[Callable[..., None]], Callable[..., No
     Contract: ``warp.array._init_new(self, dtype, shape, strides, device, pinned)`` allocates each array; where there is
     no memory, it raises a RuntimeError that begins with "Failed to allocate". Where it is gone, nothing is replaced.
     """
-    if hasattr(wp.array, "_init_new"):
-        wp.array._init_new = replace(wp.array._init_new)
+    arrays: Any = wp.array
+    if hasattr(arrays, "_init_new"):
+        arrays._init_new = replace(arrays._init_new)
 
 
 @functools.cache

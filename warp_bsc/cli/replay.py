@@ -35,7 +35,7 @@ def _run(arguments: argparse.Namespace) -> int:
         for device in {device.arch: device for device in devices}.values():  # for which kernels are compiled
             with loading_kernels(device):
                 load_detector(arguments.method, scene.dtype, device, **also, strands=scene.has_strands)
-        name = ",".join(map(str, devices))
+        name = ",".join(dict.fromkeys(map(str, devices)))
     with ReplayRun(scene, arguments, name, options, baseline) as run:
         return run.run()
 

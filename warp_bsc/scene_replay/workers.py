@@ -207,7 +207,7 @@ def check_in_workers(scene: Scene, checks: Checks, workers: Workers, first: int 
         Exception: Errors of checking an interval, after the results of all intervals before it.
     """
     job = pack(scene, checks)
-    calls = deque(_chunk_call(scene, job, *chunk) for chunk in _cut(scene, first, workers.count))
+    calls = deque(_chunk_call(scene, job, *chunk) for chunk in cut_in_chunks(scene, first, workers.count))
     for found in results_in_order(workers, calls):
         left_out = len(scene.left_out)
         for result in unpack(scene, found):
@@ -326,7 +326,7 @@ def _chunk_call(scene: Scene, job: bytes, first: int, stop: int) -> WorkerCall:
     return WorkerCall(activity, check_chunk, (job, first, stop))
 
 
-def _cut(scene: Scene, first: int, worker_count: int) -> Iterator[tuple[int, int]]:
+def cut_in_chunks(scene: Scene, first: int, worker_count: int) -> Iterator[tuple[int, int]]:
     """Yields the chunks: the first interval and the one after the last of each."""
     position_bytes = max(1, 3 * scene.vertex_count * scene.dtype.itemsize)
     left, most = len(scene) - first, max(1, min(_MOST_INTERVALS, _CHUNK_BYTES // position_bytes))

@@ -30,14 +30,15 @@ def _explain(device: wp.Device, shape: tuple[int, ...], dtype: Any) -> DeviceMem
     # a method, rather than a function that it calls to make an array
     file, function, line = next((place for place in places if "." in place[1].partition(".<locals>")[0]), places[0])
     function = function.partition(".<locals>")[0]
-    callers = [name for path, name, _ in places if "cli" not in path.parts and not re.search(r"(^|\.)[_<]", name)]
+    called = [name.removesuffix(".__init__") for path, name, _ in places if path.parent.name != "cli"]
+    public = [name for name in called if not re.search(r"(^|\.)[_<]", name)]
     target, is_assignment, _ = linecache.getline(str(file), line).strip().partition(" = ")
     count, size = math.prod(shape), wp.types.type_size_in_bytes(dtype)
     free = device.free_memory if device.is_cuda else 0
     if device.is_cpu and "SC_AVPHYS_PAGES" in getattr(os, "sysconf_names", {}):
         free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     left = f"; {free / 1e6:,.6g} MB are free, enough for {free // size:,}" if free else ""
-    caller = callers[-1] if callers else function
+    caller = public[-1] if public else function
     name = f"{target} in {function}" if is_assignment else function
     return DeviceMemoryError(
         f"out of memory on {device}: {caller} needs {count * size / 1e6:,.6g} MB for {name} ({file.name}:{line}), "
