@@ -69,10 +69,9 @@ def on_compilation(report: Callable[[bool], None]) -> None:
 
 
 def replace_allocation(replace: Callable[[Callable[..., None]], Callable[..., None]]) -> None:
-    """Replaces the function that allocates an array by what another one makes of it.
+    """Replaces Warp's function that allocates arrays, and fails without memory; nothing where its name is gone.
 
-    Contract: ``warp.array._init_new(self, dtype, shape, strides, device, pinned)`` allocates each array; where there is
-    no memory, it raises a RuntimeError that begins with "Failed to allocate". Where it is gone, nothing is replaced.
+    Contract: ``warp.array._init_new(self, dtype, shape, strides, device, pinned)`` raises "Failed to allocate ..." then.
     """
     arrays: Any = wp.array
     if hasattr(arrays, "_init_new"):

@@ -27,7 +27,6 @@ def _explain(device: wp.Device, shape: tuple[int, ...], dtype: Any) -> DeviceMem
     places = [place for place in stack if _PACKAGE in place[0].parents and place[0] != Path(__file__)]
     if not places:
         return None
-    # a method, rather than a function that it calls to make an array
     file, function, line = next((place for place in places if "." in place[1].partition(".<locals>")[0]), places[0])
     function = function.partition(".<locals>")[0]
     called = [name.removesuffix(".__init__") for path, name, _ in places if path.parent.name != "cli"]
@@ -38,10 +37,9 @@ def _explain(device: wp.Device, shape: tuple[int, ...], dtype: Any) -> DeviceMem
     if device.is_cpu and "SC_AVPHYS_PAGES" in getattr(os, "sysconf_names", {}):
         free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     left = f"; {free / 1e6:,.6g} MB are free, enough for {free // size:,}" if free else ""
-    caller = public[-1] if public else function
     name = f"{target} in {function}" if is_assignment else function
     return DeviceMemoryError(
-        f"out of memory on {device}: {caller} needs {count * size / 1e6:,.6g} MB for {name} ({file.name}:{line}), "
+        f"out of memory on {device}: {[function, *public][-1]} needs {count * size / 1e6:,.6g} MB for {name} ({file.name}:{line}), "
         f"{count:,} of {dtype.__name__}{left}. Less is needed by fewer worlds, a part of the mesh at a time, a smaller "
         "distance, or fewer processes on a device"
     )
