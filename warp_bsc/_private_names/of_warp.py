@@ -71,7 +71,7 @@ def on_compilation(report: Callable[[bool], None]) -> None:
 def replace_allocation(replace: Callable[[Callable[..., None]], Callable[..., None]]) -> None:
     """Replaces Warp's function that allocates arrays, and fails without memory; nothing where its name is gone.
 
-    Contract: ``warp.array._init_new(self, dtype, shape, strides, device, pinned)`` raises "Failed to allocate ..." then.
+    Contract: ``warp.array._init_new(self, dtype, shape, strides, device, pinned)`` raises "Failed to allocate ...".
     """
     arrays: Any = wp.array
     if hasattr(arrays, "_init_new"):
