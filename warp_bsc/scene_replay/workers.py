@@ -244,7 +244,7 @@ def checked_workers(workers: Any, devices: str | None) -> int | str:
         return checked_integer(count if workers is None else workers, "workers", count)
     if count > 1:
         raise ValueError(
-            f"device must be one, such as cuda, for a cluster, whose workers have their own, not {devices}"
+            f"workers: a cluster takes one device, such as cuda, of which each worker has its own: {devices}"
         )
     return checked_address(workers)
 
