@@ -151,7 +151,7 @@ def test_devices_that_are_not_there_or_too_many(waves, capsys):
         (("--device", "cpu,cuda:99"), "--device cuda:99: there is no such device here, only cpu"),
         (("--device", "cpu,"), "--device : there is no such device here, only cpu"),
         (("--device", "cpu,cpu", "--workers", "1"), "--workers must be an integer of at least 2"),
-        (("--device", "cpu,cpu", "--workers", "tcp://head:8786"), "--workers: a cluster takes one device, such as"),
+        (("--device", "cpu,cpu", "--workers", "tcp://h:1"), "--workers: a cluster takes one device, such as"),
     ):
         assert main(["replay", waves, *options]) == 2
         assert said in capsys.readouterr().err
