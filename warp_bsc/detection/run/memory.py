@@ -40,8 +40,8 @@ def _explain(device: wp.Device, shape: tuple[int, ...], dtype: Any) -> DeviceMem
     name = f"{target} in {function}" if is_assignment else function
     return DeviceMemoryError(
         f"out of memory on {device}: {[function, *public][-1]} needs {count * size / 1e6:,.6g} MB for {name} "
-        f"({file.name}:{line}), {count:,} of {dtype.__name__}{left}. Less is needed by fewer worlds, a part of the mesh "
-        "at a time, a smaller distance, or fewer processes on a device"
+        f"({file.name}:{line}), {count:,} of {dtype.__name__}{left}. Less is needed by fewer worlds, a part of the "
+        "mesh at a time, a smaller distance, or fewer processes on a device"
     )
 
 
