@@ -138,6 +138,41 @@ def test_two_workers_write_the_same_files(troubled, alone, tmp_path, capsys):
     assert len(re.findall(r"^  \S+:\d+ on cpu: \d+ intervals?, \d+\.\d+ s$", printed, re.MULTILINE)) == 2
 
 
+def test_a_process_for_each_named_device_writes_the_same_files(waves, tmp_path, capsys):
+    """Also for one that is named twice, which is how a CPU tries several."""
+    wanted = run(waves, tmp_path / "1")
+    capsys.readouterr()
+    assert not say_where(run(waves, tmp_path / "2", "--device", "cpu,cpu"), wanted)
+    assert len(re.findall(r"^  \S+:\d+ on cpu: \d+ intervals?,", capsys.readouterr().out, re.MULTILINE)) == 2
+
+
+def test_devices_that_are_not_there_or_too_many(waves, capsys):
+    for options, said in (
+        (("--device", "cpu,cuda:99"), "--device cuda:99: there is no such device here, only cpu"),
+        (("--device", "cpu,"), "--device : there is no such device here, only cpu"),
+        (("--device", "cpu,cpu", "--workers", "1"), "--workers must be an integer of at least 2"),
+        (("--device", "cpu,cpu", "--workers", "tcp://h:1"), "--workers: a cluster takes one device, such as"),
+    ):
+        assert main(["replay", waves, *options]) == 2
+        assert said in capsys.readouterr().err
+    with pytest.raises(ValueError, match=r"^workers must be an integer of at least 2"):
+        bsc.replay(bsc.Scene(waves), device="cpu,cpu", workers=1)
+    with pytest.raises(ValueError, match="cuda:99: there is no such device here, only cpu"):
+        list(bsc.replay(bsc.Scene(waves), device="cpu,cuda:99"))
+
+
+@pytest.mark.parametrize("intervals", [0, 1, 7, 50, 1000])
+def test_chunks_are_of_equal_length(waves, monkeypatch, intervals):
+    """All workers then end at about the same time; 50 intervals on 4 GPUs are 16 chunks of 3 or 4."""
+    scene = bsc.Scene(waves)
+    monkeypatch.setattr(bsc.Scene, "__len__", lambda _: intervals + 3)
+    chunks = list(workers.cut_in_chunks(scene, 3, 4))
+    assert [number for chunk in chunks for number in range(*chunk)] == list(range(3, intervals + 3))
+    lengths = {stop - start for start, stop in chunks}
+    assert max(lengths, default=0) - min(lengths, default=0) <= 1 and max(lengths, default=1) <= 16
+    assert len(chunks) == {50: 16}.get(intervals, len(chunks))
+
+
 @pytest.mark.slow
 def test_workers_compare_with_a_baseline(tmp_path, waves):
     run(waves, tmp_path / "1")
@@ -422,6 +457,9 @@ def test_a_pickled_scene_keeps_its_welds(tmp_path, monkeypatch, troubled):
         ("cuda:1", 0, 4, "cuda:1"),
         ("cpu", 1, 4, "cpu"),
         (None, 1, 0, None),
+        ("cpu,cuda:1", 0, 4, "cpu"),
+        ("cpu,cuda:1", 3, 4, "cuda:1"),
+        ("cuda:1,cuda:1,cuda:0", 4, 2, "cuda:1"),
     ],
 )
 def test_each_local_worker_has_a_gpu(name, number, gpus, device):

@@ -23,12 +23,8 @@ def cpu_graph() -> Any:
             cannot be captured on the CPU. Graphs on CUDA do not need it.
     """
     warn_if_untested("warp")
-    try:
-        graph = wp._src.context.runtime._apic_graph
-        is_known = isinstance(graph.apic, bool)
-    except AttributeError:
-        is_known = False
-    if not is_known:
+    graph = getattr(wp._src.context.runtime, "_apic_graph", None)
+    if not isinstance(getattr(graph, "apic", None), bool):
         raise RuntimeError(f"Warp {wp.__version__} does not say which graph the CPU captures: run this outside graphs")
     return graph
 
@@ -61,18 +57,25 @@ def on_compilation(report: Callable[[bool], None]) -> None:
     compiled, and for none that is in the cache. The kernels of a module are the values of ``kernels``; ``func`` is the
     Python function of each. Where that name is gone, nothing is reported.
     """
-    module = wp._src.context.Module
-    generate = getattr(module, "_run_codegen", None)
-    if generate is None:
-        return
+    generate: Any = getattr(wp._src.context.Module, "_run_codegen", None)
 
-    @functools.wraps(generate)
     def reported(self: Any, options: dict[str, Any], is_cpu: bool) -> Any:
         if any((kernel.func.__module__ or "").startswith("warp_bsc.") for kernel in self.kernels.values()):
             report(is_cpu)
         return generate(self, options, is_cpu)
 
-    module._run_codegen = reported
+    if generate is not None:
+        wp._src.context.Module._run_codegen = functools.wraps(generate)(reported)
+
+
+def replace_allocation(replace: Callable[[Callable[..., None]], Callable[..., None]]) -> None:
+    """Replaces Warp's function that allocates arrays, and fails without memory; nothing where its name is gone.
+
+    Contract: ``warp.array._init_new(self, dtype, shape, strides, device, pinned)`` raises "Failed to allocate ...".
+    """
+    arrays: Any = wp.array
+    if hasattr(arrays, "_init_new"):
+        arrays._init_new = replace(arrays._init_new)
 
 
 @functools.cache
@@ -93,10 +96,10 @@ def paused_tape() -> Iterator[wp.Tape | None]:
         RuntimeError: If this version of Warp has no such name: a tape would record kernels of the stage, and gradients
             would be wrong.
     """
-    try:
-        tape = wp._src.context.runtime.tape
-    except AttributeError:
-        raise missing("warp", "context.runtime.tape", "a step cannot pause the active tape") from None
+    runtime = wp._src.context.runtime
+    if not hasattr(runtime, "tape"):
+        raise missing("warp", "context.runtime.tape", "a step cannot pause the active tape")
+    tape = runtime.tape
     if tape is None:
         yield None
         return
@@ -105,6 +108,9 @@ def paused_tape() -> Iterator[wp.Tape | None]:
         yield tape
     finally:
         tape.__enter__()
+
+
+_make_empty = functools.cache(lambda struct: struct())
 
 
 def struct_type(struct: Any) -> Any:
@@ -129,11 +135,6 @@ def empty_struct(value: Any) -> Any:
     return _make_empty(struct_type(value)) if wp.types.is_struct(value) else None
 
 
-@functools.cache
-def _make_empty(struct):
-    return struct()
-
-
 def struct_fields(struct: Any) -> list[str]:
     """Returns the names of the fields of a Warp struct, in their order.
 
@@ -142,7 +143,6 @@ def struct_fields(struct: Any) -> list[str]:
     Raises:
         RuntimeError: If it does not.
     """
-    try:
-        return list(struct.vars)
-    except AttributeError:
-        raise missing("warp", "attribute vars of structs", "the stage cannot be constructed") from None
+    if not hasattr(struct, "vars"):
+        raise missing("warp", "attribute vars of structs", "the stage cannot be constructed")
+    return list(struct.vars)

@@ -33,6 +33,11 @@ def find_device(name: str | None) -> wp.Device:
         raise ValueError(f"--device {error}") from None
 
 
+def find_devices(names: str | None) -> list[wp.Device]:
+    """Returns the Warp devices whose names have commas between them; errors are those of :func:`find_device`."""
+    return [find_device(name) for name in start.device_names(names)]
+
+
 @contextlib.contextmanager
 def loading_kernels(device: wp.DeviceLike, console: rich.console.Console | None = None) -> Iterator[None]:
     """Prints a message if kernels are compiled in the block for more than two seconds, and then how many have been.

@@ -53,7 +53,7 @@ def describe(error: BaseException) -> str:
     """
     usd_errors = [part.commentary for part in error.args if hasattr(part, "commentary")]  # of a Tf.ErrorException
     text = " ".join(("; ".join(usd_errors) or str(error)).split())
-    if usd_errors or (isinstance(error, OSError | ValueError | ImportError) and text):
+    if usd_errors or (isinstance(error, OSError | ValueError | ImportError | MemoryError) and text):
         return with_option(text)
     text = ": ".join(filter(None, [type(error).__name__, text]))
     folder = Path(__file__).parents[1]

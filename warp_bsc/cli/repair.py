@@ -15,7 +15,7 @@ from ..scene_replay.hit_files import replay_facts
 from ..usd.read.tetrahedra import NOT_REPAIRED
 from ..usd.scene import Scene
 from ..usd.write.points_layer import PointsLayer
-from .device import find_device, load_detector, loading_kernels
+from .device import find_device, find_devices, load_detector, loading_kernels
 from .exit_status import ExitStatus, explain_statuses
 from .options import (
     DEVICE,
@@ -159,7 +159,7 @@ def _run(arguments: argparse.Namespace) -> int:
         if "distorted" in arguments.fail_on:
             raise ValueError("--fail-on distorted is for shots; --max-strain bounds the strain of one frame")
         return repair_files(frames, arguments)
-    device = find_device(arguments.device)
+    device = find_device(arguments.device) if frames else find_devices(arguments.device)[0]
     chosen = {"selection": read_selection(arguments), "frames": arguments.frames}
     if frames:
         outputs = frames.outputs(arguments.keep, arguments.output)

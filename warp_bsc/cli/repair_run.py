@@ -260,7 +260,7 @@ def find(
 ) -> list[Finding]:
     """Returns what an exact replay of a scene finds, and shows its progress; pairs as of :func:`.find_collisions`."""
     options = {"keep": arguments.keep, "unrepaired_pairs": unrepaired_pairs, "min_distance": arguments.min_distance}
-    return list(find_collisions(scene, tracked(scene, activity, device), **options, device=device))
+    return list(find_collisions(scene, tracked(scene, activity, arguments.device), **options, device=device))
 
 
 def _interval_after(scene: Scene, stretch: RepairedStretch) -> int:
@@ -268,7 +268,7 @@ def _interval_after(scene: Scene, stretch: RepairedStretch) -> int:
     return len(scene) if stretch.start == stretch.end else scene.times.index(stretch.end)
 
 
-def tracked(scene: Scene, activity: str, device: str) -> Iterator[IntervalResult]:
+def tracked(scene: Scene, activity: str, device: str | None) -> Iterator[IntervalResult]:
     """Yields what an exact replay finds, and shows its progress."""
     with RunProgress(activity) as progress:
         progress.show(0, len(scene))

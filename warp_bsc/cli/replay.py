@@ -5,9 +5,9 @@ from typing import Any
 
 from .._atomic_file import STDOUT, unfinished_path
 from ..scene_replay.baseline import Baseline
-from ..scene_replay.workers import device_of_cluster
+from ..scene_replay.workers import checked_workers, device_of_cluster
 from ..usd.scene import Scene
-from .device import find_device, load_detector, loading_kernels
+from .device import find_devices, load_detector, loading_kernels
 from .options import Commands, add_command, scene_path
 from .replay_options import DESCRIPTION, EPILOG, add_replay_options, describe_selection, read_scene, read_selection
 from .replay_run import ReplayRun
@@ -27,19 +27,16 @@ def _run(arguments: argparse.Namespace) -> int:
         settings = {"method": arguments.method, "clearance": arguments.clearance, "options": options}
         baseline = Baseline(arguments.baseline, **settings)
     if isinstance(arguments.workers, str):
-        device = device_of_cluster(arguments.workers, arguments.device)
+        name = device_of_cluster(arguments.workers, arguments.device)
     else:
-        device = find_device(arguments.device)
-        with loading_kernels(device):
-            load_detector(
-                arguments.method,
-                scene.dtype,
-                device,
-                intersections=arguments.intersections,
-                proximities=arguments.clearance is not None,
-                strands=scene.has_strands,
-            )
-    with ReplayRun(scene, arguments, str(device), options, baseline) as run:
+        devices = find_devices(arguments.device)
+        checked_workers(arguments.workers, arguments.device)
+        also = {"intersections": arguments.intersections, "proximities": arguments.clearance is not None}
+        for device in {device.arch: device for device in devices}.values():  # for which kernels are compiled
+            with loading_kernels(device):
+                load_detector(arguments.method, scene.dtype, device, **also, strands=scene.has_strands)
+        name = ",".join(dict.fromkeys(map(str, devices)))
+    with ReplayRun(scene, arguments, name, options, baseline) as run:
         return run.run()
 
 

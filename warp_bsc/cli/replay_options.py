@@ -337,10 +337,10 @@ _OUTPUT: Options = {
 _RUNNING: Options = {
     "--workers": number(
         _workers,
-        "check intervals in N processes on this machine, which share its cores or, unless --device names one "
-        "such as cuda:0, its GPUs (default: 1); or in the workers of the Dask cluster whose scheduler has this "
-        "address, such as tcp://head:8786, which need the scene at the same path and pip install 'warp-bsc[cluster]'",
-        default=1,
+        "check intervals in N processes on this machine, which share its cores and the devices of --device or, "
+        "unless it names one such as cuda:0, its GPUs (default: one for each device); or in the workers of the Dask "
+        "cluster whose scheduler has this address, such as tcp://head:8786, which need the scene at the same path and "
+        "pip install 'warp-bsc[cluster]', and use the one --device as they see it",
         metavar="N|ADDRESS",
     ),
     "--progress": {

@@ -78,12 +78,7 @@ class CollisionDetector:
         check_instance(mesh, "mesh", CollisionMesh, "a CollisionMesh")
         self.mesh = mesh
         self._pipeline = DetectionPipeline(
-            mesh,
-            method=method,
-            tolerance=tolerance,
-            min_distance=min_distance,
-            rings=rings,
-            only_used_vertices=True,
+            mesh, method=method, tolerance=tolerance, min_distance=min_distance, rings=rings, only_used_vertices=True
         )
         self.method: Method = method
         self.tolerance = self._pipeline.tolerance
@@ -128,6 +123,7 @@ class CollisionDetector:
                 from where it takes its bodies, coordinates are more than 2^500, its tolerance is too small for the
                 rounding of positions, or the positions require gradients.
             RuntimeError: If the device captures a graph, see :meth:`capture`.
+            MemoryError: If the memory of the device does not suffice; the message names what for, and what needs less.
         """
         self._check_not_capturing("call capture(x0, x1) there", " instead of detect")
         x0, x1 = self._checked_positions(x0, x1)

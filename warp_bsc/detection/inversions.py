@@ -106,9 +106,8 @@ def inversions_of_motion(
         ValueError: If a position of a tetrahedron is not finite.
     """
     device, tets, n = mesh.device, mesh.device_tets, len(mesh.tets)
-    status = wp.zeros(n, dtype=wp.int8, device=device)
-    toi = wp.zeros(n, dtype=wp.float64, device=device)
-    within_tolerance = wp.zeros(n, dtype=bool, device=device)
+    types = wp.int8, wp.float64, bool
+    status, toi, within_tolerance = (wp.zeros(n, dtype=dtype, device=device) for dtype in types)
 
     def classify(roundoff):
         inputs = [x0, x1, tets, roundoff, wp.float64(tolerance)]

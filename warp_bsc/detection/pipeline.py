@@ -367,8 +367,8 @@ class DetectionPipeline:
             ValueError: If a buffer cannot be large enough.
         """
         counts = self.counts = self.counters.read()
-        if not self.overflows(counts):
-            return False
+        if not self.overflows(counts) and self._known_capacities == self._host_capacities():
+            return False  # nor has memory run out, the last time, before the device knew what had grown
         self.generation += 1
         if self._captured:
             self._retired += [*self.broad_phase.buffers, self.capacities]
@@ -396,7 +396,9 @@ class DetectionPipeline:
 
     def update_capacities(self) -> None:
         """Makes ``capacities`` anew, after a buffer was replaced."""
-        self.capacities = wp.array(self._host_capacities().values(), dtype=wp.int64, device=self.mesh.device)
+        capacities = self._host_capacities()
+        self.capacities = wp.array(capacities.values(), dtype=wp.int64, device=self.mesh.device)
+        self._known_capacities = capacities  # once the device has them
 
     def _launch_count_not_finite(self, x0: wp.array, x1: wp.array) -> None:
         """Launches the count on the CPU; the broad phase of a GPU counts while it boxes the elements."""

@@ -88,6 +88,7 @@ def repair(
         ValueError: If an array has another shape or type, is not finite or out of range, ``x_previous`` crosses, a
             number is out of range, a device is given with a mesh, or ``seam_tolerance`` makes one of two fixed vertices
             that are apart, or of two corners of a face.
+        MemoryError: If the memory of the device does not suffice.
 
     References:
         Pascal Volino and Nadia Magnenat-Thalmann. "Resolving Surface Collisions through Intersection Contour

@@ -2,7 +2,6 @@
 
 import contextlib
 import functools
-import time
 from typing import Any
 
 import newton
@@ -11,12 +10,14 @@ from newton.solvers.experimental.coupled import SolverCoupled
 
 from .._arguments import checked_number
 from .._one_thread import one_at_a_time
-from .._private_names.of_newton import SHAPES_CHANGE
+from .._private_names.of_newton import SHAPES_CHANGE, body_q_prev
 from .._private_names.of_warp import paused_tape
 from .._warnings import warn_caller
+from ..detection.run.phase_timer import PhaseTimer
 from .drive.coupled_check import CoupledCheck, has_elements_of_other_entries, unseen_shapes
 from .drive.coupling import CouplingHooks
 from .drive.inner_steps import InnerSteps, StepCall
+from .drive.snapshot import Snapshot
 from .drive.world_mask import WorldMask, checked_mask
 from .report.count_steps import count_step, merge_step, note_crossings
 from .report.count_worlds import WorldCounter
@@ -24,7 +25,7 @@ from .report.report import SolverReport
 from .report.text import unseen_warning
 from .state.kept_distances import KeptDistances
 from .state.mesh import ModelMesh, unseen_strands
-from .state.motion import ModelMotion, arrays_of, find_set_bodies
+from .state.motion import arrays_of, find_set_bodies
 from .state.status import Loop
 from .state.workspace import Workspace
 from .step import prepare
@@ -42,16 +43,9 @@ class CollisionStage(CouplingHooks):
     _keeps_strands = False  # apart by the radii of the model, without arguments
     _counter: WorldCounter | None = None  # of results by world, if the report is asked for them
     _inner: InnerSteps  # how the inner solver takes a step
+    _start: Snapshot | None = None  # what a step that fails puts back
 
-    def _allocate(
-        self,
-        motion: ModelMotion,
-        separation: float,
-        restitution: wp.array,
-        *,
-        max_iterations: int = MAX_ITERATIONS,
-        responds: bool = True,
-    ):
+    def _allocate(self, motion, separation, restitution, *, max_iterations=MAX_ITERATIONS, responds=True):
         """Allocates the workspace of steps, and makes the report."""
         self.mesh, self._motion, self._responds = motion.mesh, motion, responds
         options = {"max_iterations": max_iterations, "has_few_contacts": self._has_few_contacts}
@@ -134,16 +128,40 @@ class CollisionStage(CouplingHooks):
             NotImplementedError: If a tape is active and the model requires gradients, and the step carries none: that
                 of a :class:`.solver_ccd.SolverCCD`, or of a part of the worlds.
             RuntimeError: If another thread is using this stage, or if the first ``world_mask`` is given in a graph.
+            MemoryError: If the memory of the device does not suffice. After any error in a step outside graphs,
+                ``state_in`` and the report are as before; another ``state_out`` holds nothing.
         """
         call = self._checked_call(state_in, state_out, control, contacts, dt, world_mask, options)
-        for step in self._inner.parts(call):  # the step itself, or its substeps
-            with self._entered(step):  # keeps its start, and whatever the inner solver must not change
-                self._inner.take(step)  # the inner solver predicts its end
-                with paused_tape():
-                    self._leave_out(step)  # worlds that take no part
-                    self._resolve(step)  # detects the contacts of the motion, and resolves them
+        with self._restored_on_error(state_in):
+            for step in self._inner.parts(call):  # the step itself, or its substeps
+                with self._entered(step):  # keeps its start, and whatever the inner solver must not change
+                    self._inner.take(step)  # the inner solver predicts its end
+                    with paused_tape():
+                        if step.mask is not None:
+                            self._world_mask.restore(step.mask, step.state_out)  # worlds that take no part
+                        self._resolve(step)  # detects the contacts of the motion, and resolves them
         if not self.mesh.device.is_capturing:
             self.report.warn()
+
+    @contextlib.contextmanager
+    def _restored_on_error(self, state):
+        """Restores the state at the start of a step, and the report, if the step fails: some solvers write to both.
+
+        A graph whose capture fails is never launched.
+        """
+        report, start = self.report, None
+        kept = [vars(state), vars(report), vars(report.step_results), {"poses": body_q_prev(self.solver)}]
+        arrays = [x for values in kept for x in values.values() if isinstance(x, wp.array) and x.size]
+        with paused_tape():
+            if not self.mesh.device.is_capturing:
+                start = self._start = Snapshot([*arrays, *self._motion.last.arrays], before=self._start)
+        try:
+            yield
+        except Exception:
+            with paused_tape():
+                if start is not None:
+                    start.restore()
+            raise
 
     def _checked_call(self, state_in, state_out, control, contacts, dt, world_mask, options):
         """Returns the arguments of a step, checked, with the active tape if the model requires gradients."""
@@ -178,11 +196,6 @@ class CollisionStage(CouplingHooks):
             if self._coupled is not None:
                 self._coupled.finish()
                 self.report.copy_totals()
-
-    def _leave_out(self, step):
-        """Restores the state of worlds that take no part in a step, which the inner solver has stepped."""
-        if step.mask is not None:
-            self._world_mask.restore(step.mask, step.state_out)
 
     def _find_set_bodies(self, start):
         """Counts dynamic bodies whose pose a program writes between steps, which the stage takes to be there."""
@@ -243,19 +256,11 @@ class CollisionStage(CouplingHooks):
     @contextlib.contextmanager
     def _timed(self, substep):
         """Measures the time of a step, or a substep, for the report; does nothing while capturing."""
-        device = self.mesh.device
-        if device.is_capturing:
+        timer = PhaseTimer(self.mesh.device)
+        with timer.phase("step"):
             yield
-            return
-
-        def now():
-            if device.is_cuda:
-                return wp.record_event(wp.Event(device, enable_timing=True))
-            return time.perf_counter()
-
-        start = now()
-        yield
-        self.report.spans = [*self.report.spans[:substep], (start, now())]
+        if not self.mesh.device.is_capturing:
+            self.report.timers = [*self.report.timers[:substep], timer]
 
     @one_at_a_time
     def notify_model_changed(self, flags: int) -> None:

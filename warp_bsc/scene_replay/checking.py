@@ -311,10 +311,7 @@ class _SegmentNamer:
             inside = self._containment.find(x, found, self._duplicates.may_be_checked(are_checked))
             inside = self._duplicates.with_twins(inside, are_checked)
             mesh = self._strand_mesh or self._mesh
-            self._intersections = (
-                found,
-                name_intersections(self.segment, mesh, found, inside, x, time, selection),
-            )
+            self._intersections = (found, name_intersections(self.segment, mesh, found, inside, x, time, selection))
         return self._intersections[1]
 
     def _name_proximities(self, found: Proximities, time: float) -> SceneProximities:

@@ -10,7 +10,7 @@ from ..detection.run.settings import METHODS, Method
 from ..usd.scene import Scene
 from .checking import Checks, IntervalChecker
 from .results import IntervalResult
-from .workers import Cluster, LocalWorkers, check_in_workers, checked_address, selection_without_initial_in_workers
+from .workers import Cluster, LocalWorkers, check_in_workers, checked_workers, selection_without_initial_in_workers
 
 
 def replay(
@@ -23,7 +23,7 @@ def replay(
     clearance: float | None = None,
     validate: int | Literal["all"] = 0,
     earlier: Iterable[IntervalResult] = (),
-    workers: int | str = 1,
+    workers: int | str | None = None,
 ) -> Iterator[IntervalResult]:
     """Finds the collisions in every interval between two consecutive times of a scene, one interval at a time.
 
@@ -48,7 +48,8 @@ def replay(
     Args:
         scene: The scene; its selection defines the pairs that are checked.
         method: ``"float"``, ``"conservative"`` or ``"exact"``, for collisions; intersections are always exact.
-        device: Warp device or its name; default: Warp's default.
+        device: Warp device or its name; default: Warp's default. Several names with commas between them, such as
+            ``"cuda:0,cuda:1"``, are each for a process of its own, also one named twice; results are the same.
         intersections: Whether to find the intersections at each time, and the meshes that are wholly inside others.
         ignore_initial: Whether to ignore all pairs of meshes that cross at the first time, and meshes that cross
             themselves then: their collisions and intersections are only counted. For a mesh that is inside another
@@ -64,9 +65,11 @@ def replay(
             after the initial intersections have been found, and the replay resumes after them.
         workers: Number of processes on this machine that check intervals, 1 for this process alone; or the address of
             the scheduler of a Dask cluster, such as ``"tcp://head:8786"``, whose workers check them. Each process uses
-            its share of the cores or, if ``device`` is ``"cuda"`` or None, one GPU. With more than one process, a
-            program must have ``if __name__ == "__main__":`` around its statements, as :mod:`multiprocessing` requires.
-            The workers of a cluster open the scene by the same path, and need ``pip install 'warp-bsc[usd,cluster]'``.
+            its share of the cores and, in turns, one of the named devices or, if ``device`` is ``"cuda"`` or None, one
+            GPU; default: one process for each named device. With more than one process, a program must have ``if
+            __name__ == "__main__":`` around its statements, as :mod:`multiprocessing` requires. The workers of a
+            cluster open the scene by the same path, need ``pip install 'warp-bsc[usd,cluster]'``, and each use
+            ``device``, one alone, as they see it: dask-cuda gives each a GPU, ``CUDA_VISIBLE_DEVICES`` as well.
 
     Yields:
         IntervalResult: The collisions of one interval, in order, the same for any number of workers. Only the results
@@ -75,8 +78,9 @@ def replay(
 
     Raises:
         TypeError: If an argument has another type; all errors in arguments are raised at the call.
-        ValueError: If the positions at some time are broken, a choice or an address is unknown, a number is out of
-            range, or initial intersections are ignored but intersections are not found.
+        ValueError: If the positions at some time are broken, a choice, a device or an address is unknown, a number is
+            out of range, or initial intersections are ignored but intersections are not found.
+        MemoryError: If the memory of a device does not suffice, after the results of all intervals before.
         OSError: If the scheduler cannot be reached, or if worker after worker dies while it checks the same intervals.
         ModuleNotFoundError: If Dask is needed and not installed.
     """
@@ -95,7 +99,7 @@ def replay(
         clearance=None if clearance is None else checked_distance(clearance, "clearance", zero=False),
         validate=_checked_validate(validate),
     )
-    return _replay(scene, checks, bool(ignore_initial), earlier, _checked_workers(workers))
+    return _replay(scene, checks, bool(ignore_initial), earlier, checked_workers(workers, checks.device))
 
 
 def _checked_validate(validate: Any) -> int | Literal["all"]:
@@ -107,19 +111,8 @@ def _checked_validate(validate: Any) -> int | Literal["all"]:
     return checked_integer(validate, "validate")
 
 
-def _checked_workers(workers: Any) -> int | str:
-    """Returns a number of processes, or the address of a scheduler; raises a TypeError or a ValueError otherwise."""
-    if isinstance(workers, str):
-        return checked_address(workers)
-    return checked_integer(workers, "workers", 1)
-
-
 def _replay(
-    scene: Scene,
-    checks: Checks,
-    ignore_initial: bool,
-    earlier: Iterable[IntervalResult],
-    workers: int | str,
+    scene: Scene, checks: Checks, ignore_initial: bool, earlier: Iterable[IntervalResult], workers: int | str
 ) -> Iterator[IntervalResult]:
     """Yields the results of :func:`replay`, whose arguments have been checked."""
     with contextlib.ExitStack() as stack:

@@ -17,7 +17,7 @@ from typing import Any
 
 from .._version import __version__
 from ..detection.run.launch import cores
-from ..detection.run.start import find_device, gpu_count
+from ..detection.run.start import device_names, find_device, gpu_count
 from ..usd.interval import ReadingNotes
 from ..usd.scene import Scene
 from ..usd.segment import Segment
@@ -65,16 +65,17 @@ _opened: _Opened | None = None
 
 
 def device_of_worker(name: str | None, number: int, gpu_count: int) -> str | None:
-    """Returns the name of the device that a worker on this machine uses: the GPUs in turns unless one is named.
-
-    If there are more workers than GPUs, workers share them.
+    """Returns the name of the device that a worker on this machine uses: the named ones, or else the GPUs, in turns.
 
     Args:
-        name: Name of the requested device, None for Warp's default.
+        name: Names of the requested devices, with commas between them, None for Warp's default.
         number: Number of the worker, from 0.
         gpu_count: Number of GPUs of the machine.
     """
-    return f"cuda:{number % gpu_count}" if gpu_count and name in (None, "cuda") else name
+    if gpu_count and name in (None, "cuda"):
+        return f"cuda:{number % gpu_count}"
+    names = device_names(name)
+    return names[number % len(names)]
 
 
 def serve(connection: Connection, number: int, count: int) -> None:
@@ -155,9 +156,7 @@ def _open(job: bytes, first: int) -> _Opened:
         if version != __version__:
             raise ValueError(f"{_worker_name()}: this worker has version {__version__} of warp-bsc, not {version}")
         scene, checks = pickle.load(stream)
-        device = checks.device
-        if _local:
-            device = device_of_worker(device, _local[0], gpu_count())
+        device = device_of_worker(checks.device, _local[0], gpu_count()) if _local else checks.device
         checks = replace(checks, device=find_device(device).alias)
         _opened = _Opened(job, IntervalChecker(scene, checks, _worker_name()), len(scene.left_out))
     return _opened
@@ -180,8 +179,9 @@ def _portable(error: Exception) -> Exception:
     """Returns an error with the same message that can be sent to another process."""
     if isinstance(error, OSError):
         return OSError(error.errno, error.strerror, error.filename) if error.strerror else OSError(str(error))
-    if isinstance(error, ValueError):
-        return ValueError(str(error))
+    for kind in (ValueError, MemoryError):
+        if isinstance(error, kind):
+            return kind(str(error))
     frame = traceback.extract_tb(error.__traceback__)[-1]
     place = f"{Path(frame.filename).name}:{frame.lineno}"
     return RuntimeError(f"{type(error).__name__}: {error} (in worker {_worker_name()}, {place})")

@@ -24,7 +24,8 @@ from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from typing import Any
 
-from .._arguments import given
+from .._arguments import checked_integer, given
+from ..detection.run.start import device_names
 from ..usd.scene import Scene
 from ..usd.selection import Selection
 from .checking import Checks
@@ -206,10 +207,7 @@ def check_in_workers(scene: Scene, checks: Checks, workers: Workers, first: int 
         Exception: Errors of checking an interval, after the results of all intervals before it.
     """
     job = pack(scene, checks)
-    calls = deque(
-        WorkerCall(_name_chunk(scene, start, stop), check_chunk, (job, start, stop))
-        for start, stop in _cut(scene, first, workers.count)
-    )
+    calls = deque(_chunk_call(scene, job, *chunk) for chunk in cut_in_chunks(scene, first, workers.count))
     for found in results_in_order(workers, calls):
         left_out = len(scene.left_out)
         for result in unpack(scene, found):
@@ -221,7 +219,7 @@ def check_in_workers(scene: Scene, checks: Checks, workers: Workers, first: int 
                 call.withdraw()
                 call.arguments = (job, *call.arguments[1:])
         if first < (stop := calls[0].arguments[1] if calls else len(scene)):  # the chunk has ended early
-            calls.appendleft(WorkerCall(_name_chunk(scene, first, stop), check_chunk, (job, first, stop)))
+            calls.appendleft(_chunk_call(scene, job, first, stop))
 
 
 def checked_address(address: str) -> str:
@@ -236,6 +234,21 @@ def checked_address(address: str) -> str:
     return address
 
 
+def checked_workers(workers: Any, devices: str | None) -> int | str:
+    """Returns a number of processes, by default that of the devices, or the address of a scheduler.
+
+    Raises TypeError or ValueError if it is neither, less than the devices, or of a cluster that is to use several.
+    """
+    count = len(device_names(devices))
+    if not isinstance(workers, str):
+        return checked_integer(count if workers is None else workers, "workers", count)
+    if count > 1:
+        raise ValueError(
+            f"workers: a cluster takes one device, such as cuda, of which each worker has its own: {devices}"
+        )
+    return checked_address(workers)
+
+
 def device_of_cluster(address: str, name: str | None) -> str:
     """Returns the name of the Warp device that a worker of a cluster uses.
 
@@ -248,7 +261,7 @@ def device_of_cluster(address: str, name: str | None) -> str:
         OSError: As of :class:`Cluster`.
         ValueError: If a worker has no such device.
     """
-    cluster = Cluster(address)
+    cluster = Cluster(str(checked_workers(address, name)))
     try:
         return cluster.result(cluster.submit(name_device, name))
     finally:
@@ -307,15 +320,16 @@ def results_in_order(workers: Workers, calls: deque[WorkerCall]) -> Iterator[Any
         yield result
 
 
-def _name_chunk(scene: Scene, first: int, stop: int) -> str:
-    """Returns in words what is done with a chunk."""
-    return f"checked time {scene.times[first]:g} to {scene.times[stop]:g}"
+def _chunk_call(scene: Scene, job: bytes, first: int, stop: int) -> WorkerCall:
+    """Returns the call that checks a chunk."""
+    activity = f"checked time {scene.times[first]:g} to {scene.times[stop]:g}"
+    return WorkerCall(activity, check_chunk, (job, first, stop))
 
 
-def _cut(scene: Scene, first: int, worker_count: int) -> Iterator[tuple[int, int]]:
+def cut_in_chunks(scene: Scene, first: int, worker_count: int) -> Iterator[tuple[int, int]]:
     """Yields the chunks: the first interval and the one after the last of each."""
     position_bytes = max(1, 3 * scene.vertex_count * scene.dtype.itemsize)
-    for_all = -(-(len(scene) - first) // (_CHUNKS_EACH * worker_count))
-    size = max(1, min(for_all, _MOST_INTERVALS, _CHUNK_BYTES // position_bytes))
-    for start in range(first, len(scene), size):
-        yield start, min(start + size, len(scene))
+    left, most = len(scene) - first, max(1, min(_MOST_INTERVALS, _CHUNK_BYTES // position_bytes))
+    count = min(left, max(_CHUNKS_EACH * worker_count, -(-left // most)))
+    for number in range(count):
+        yield first + left * number // count, first + left * (number + 1) // count

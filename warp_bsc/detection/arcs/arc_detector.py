@@ -7,7 +7,7 @@ from ..narrow.contact_buffer import ContactRows, contacts_from_host
 from ..pipeline import DetectionPipeline
 from ..results.collision_finder import CollisionFinder
 from ..results.collisions import CapturedCollisions, Collisions
-from ..run.phase_timer import PhaseTimer, PhaseTimers
+from ..run.phase_timer import PhaseTimer
 from ..run.settings import add_counts
 from .arc_pipeline import LARGEST_TURN, ArcPipeline
 from .arc_search import ArcSearch, join_contacts, straight_mesh
@@ -64,7 +64,7 @@ class ArcDetector:
         contacts, counts = search.find(bounds, x0, changed, timer)
         if others is not None:
             found = others.find(x0, x1, changed=changed)
-            timer = PhaseTimers(timer, found._timer)
+            timer.others.append(found._timer)
             for kind, rows in found._rows.items():
                 contacts[kind] = join_contacts([contacts[kind], rows.read()])
             counts = add_counts(counts, found._counts.without_filtered())

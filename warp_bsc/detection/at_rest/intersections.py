@@ -289,8 +289,8 @@ class IntersectionFinder:
         return grows
 
     def _allocate(self, capacity: int) -> None:
-        self._kept = wp.empty(capacity, dtype=wp.vec2i, device=self._mesh.device)
-        self._status = wp.empty(capacity, dtype=wp.int8, device=self._mesh.device)
+        made = (wp.empty(capacity, dtype=dtype, device=self._mesh.device) for dtype in (wp.vec2i, wp.int8))
+        self._kept, self._status = made  # both or none
 
     def _keep_crossings(self, x: wp.array) -> None:
         inputs = [x, self._mesh.device_edges, self._mesh.device_faces, self._pairs]

@@ -132,9 +132,8 @@ class _ProximityQueue:
         self._count = 0
 
     def _allocate(self, capacity: int) -> None:
-        self.pairs = wp.empty(capacity, dtype=wp.vec2i, device=self._device)
-        self.distance = wp.empty(capacity, dtype=wp.float64, device=self._device)
-        self.position = wp.empty(capacity, dtype=wp.vec3d, device=self._device)
+        made = (wp.empty(capacity, dtype=dtype, device=self._device) for dtype in (wp.vec2i, wp.float64, wp.vec3d))
+        self.pairs, self.distance, self.position = made  # all or none
 
     def grow(self, queued: int, found: int) -> bool:
         """Enlarges the buffers that were too small for some counts, and returns whether any was."""

@@ -51,10 +51,13 @@ class NarrowPhase:
     def allocate_contacts(self, capacity: int) -> None:
         """Replaces the contacts, and the buffers of their order and of the exact phase."""
         device = self.counts.device
-        self.contacts = make_contact_buffer(capacity, device)
-        self._keys = wp.empty(2 * capacity, dtype=wp.int64, device=device)
-        self._order = wp.empty(2 * capacity, dtype=int, device=device)
-        self._for_exact = [wp.empty(capacity, dtype=int, device=device) for _ in range(2)]
+        keys, order = (wp.empty(2 * capacity, dtype=dtype, device=device) for dtype in (wp.int64, int))
+        for_exact = [wp.empty(capacity, dtype=int, device=device) for _ in range(2)]
+        wp.empty(
+            capacity, dtype=wp.uint8, device=device
+        )  # which the sort takes then, and without which it does nothing
+        self.contacts, self._keys, self._order = make_contact_buffer(capacity, device), keys, order  # all or none
+        self._for_exact = for_exact
 
     def fit_all(self) -> None:
         """Enlarges the buffers so that no run overflows them: all queued pairs may survive and be contacts."""

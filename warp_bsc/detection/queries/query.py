@@ -183,16 +183,7 @@ def query_vertex_vertex(
     return _query(PairKind.VERTEX_VERTEX, points, min_distance, method, toi, tolerance, device)
 
 
-def _query_into(
-    out: DeviceQueryResult,
-    kind: PairKind,
-    points: ArrayLike | wp.array,
-    min_distance: ArrayLike,
-    method: Method,
-    timed: bool,
-    tolerance: float,
-    device: wp.DeviceLike,
-) -> DeviceQueryResult:
+def _query_into(out, kind, points, min_distance, method, timed, tolerance, device) -> DeviceQueryResult:
     """Decides queries whose results stay on the device."""
     check_instance(out, "out", DeviceQueryResult, "a DeviceQueryResult")
     if not isinstance(points, wp.array):
@@ -208,15 +199,7 @@ def _query_into(
     return out
 
 
-def _query(
-    kind: PairKind,
-    points: ArrayLike | wp.array,
-    min_distance: ArrayLike,
-    method: Method,
-    timed: bool,
-    tolerance: float,
-    device: wp.DeviceLike,
-) -> QueryResult:
+def _query(kind, points, min_distance, method, timed, tolerance, device) -> QueryResult:
     checked_choice(method, "method", METHODS)
     tolerance = checked_tolerance(tolerance)
     timed = checked_flag(timed, "toi")

@@ -3,13 +3,13 @@
 import functools
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import astuple, dataclass, field
 
 import numpy as np
 import warp as wp
 
 from ..narrow.contact_buffer import ContactRows, HostContacts, empty_contacts
-from ..run.phase_timer import PhaseTimer, PhaseTimers
+from ..run.phase_timer import PhaseTimer
 from ..run.settings import Counts, Method, PairCounts, PairKind
 from .differentiable import DifferentiableContacts
 
@@ -118,13 +118,11 @@ class DetectionStats:
 
 def add_stats(first: DetectionStats, second: DetectionStats) -> DetectionStats:
     """Returns the counts and times of two detections together."""
-    buffers = {}
-    for kind in PairKind:
-        one, other = asdict(getattr(first, kind.label)), asdict(getattr(second, kind.label))
-        buffers[kind.label] = PhaseCounts(**{name: one[name] + other[name] for name in one})
+    both = [(kind.label, *(astuple(getattr(stats, kind.label)) for stats in (first, second))) for kind in PairKind]
+    counts = {label: PhaseCounts(*(a + b for a, b in zip(*pair, strict=True))) for label, *pair in both}
     milliseconds = Counter(first.milliseconds)
     milliseconds.update(second.milliseconds)
-    return DetectionStats(**buffers, milliseconds=dict(milliseconds))
+    return DetectionStats(**counts, milliseconds=dict(milliseconds))
 
 
 @dataclass(frozen=True)
@@ -190,7 +188,7 @@ class Collisions:
     _method: Method = field(repr=False)
     _counts: Counts = field(repr=False)
     _rows: dict[PairKind, ContactRows] = field(repr=False)
-    _timer: PhaseTimer | PhaseTimers = field(repr=False)
+    _timer: PhaseTimer = field(repr=False)
     _read: dict[PairKind, HostContacts] = field(default_factory=dict, init=False, repr=False)
 
     vertex_face = _Column(PairKind.VERTEX_FACE, "pairs")

@@ -18,7 +18,7 @@ from typing import Any, ParamSpec, Protocol, TypeVar
 import warp as wp
 
 from ..._private_names.of_warp import may_run_in_threads
-from . import compilation  # noqa: F401 (says so where kernels are compiled)
+from . import compilation, memory  # noqa: F401 (both say so: where kernels are compiled, where memory is short)
 
 _THREADS = os.cpu_count() or 1
 
@@ -79,17 +79,10 @@ def launch_in_turn(kernel: wp.Kernel, dim: int, times: int, *, inputs: list, val
         inputs: The inputs before that array.
         values: Two arrays, of which the first is the input of the first launch; both are overwritten.
     """
-    device = values[0].device
-    if not dim or not times:
-        return values[0]
-    with _loading(kernel, device, 0):
-        commands = [
-            wp.launch(kernel, dim, [*inputs, before], [after], device=device, record_tape=False, record_cmd=True)
-            for before, after in (values, values[::-1])
-        ]
-        for number in range(times):
-            commands[number % 2].launch()
-    return values[times % 2]
+    there_and_back = [(kernel, dim, [*inputs, before], [after]) for before, after in (values, values[::-1])]
+    launch_repeatedly(there_and_back, times // 2, device=values[0].device)
+    launch_repeatedly(there_and_back[:1], times % 2, device=values[0].device)
+    return values[times % 2 if dim else 0]
 
 
 def launch_repeatedly(
@@ -245,15 +238,8 @@ def launch_over_queue(
     entries = len(queue)
     if device.is_cpu:
         entries = min(entries, int(counts.numpy()[count]))
-    launch_over(
-        kernel,
-        entries,
-        inputs=inputs,
-        outputs=outputs,
-        device=device,
-        block_dim=block_dim,
-        max_blocks=max_blocks(device, block_dim),
-    )
+    options = {"device": device, "block_dim": block_dim, "max_blocks": max_blocks(device, block_dim)}
+    launch_over(kernel, entries, inputs=inputs, outputs=outputs, **options)
 
 
 class GrowingBuffers(Protocol):

@@ -1,6 +1,7 @@
 """Times of the phases of a detection."""
 
 import contextlib
+import itertools
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -18,6 +19,7 @@ class PhaseTimer:
         """Starts the first phase, on the device's current stream; without a device nothing is ever measured."""
         self._device = device
         self._ends: list[tuple[str, Any]] = []
+        self.others: list[PhaseTimer] = []  # whose times are added
         self._start = None if self._is_idle() else self._now()
 
     @contextlib.contextmanager
@@ -35,6 +37,8 @@ class PhaseTimer:
             passed = wp.get_event_elapsed_time(start, end) if isinstance(end, wp.Event) else 1000.0 * (end - start)
             milliseconds[name] = milliseconds.get(name, 0.0) + passed
             start = end
+        for name, passed in itertools.chain(*(other.read().items() for other in self.others)):
+            milliseconds[name] = milliseconds.get(name, 0.0) + passed
         return milliseconds
 
     def _is_idle(self) -> bool:
@@ -47,19 +51,3 @@ class PhaseTimer:
         event = wp.Event(self._device, enable_timing=True)
         wp.get_stream(self._device).record_event(event)
         return event
-
-
-class PhaseTimers:
-    """The times of several timers together."""
-
-    def __init__(self, *timers: "PhaseTimer | PhaseTimers"):
-        """Takes the timers."""
-        self._timers = timers
-
-    def read(self) -> dict[str, float]:
-        """Returns the time by phase [ms], the sum of all timers."""
-        milliseconds: dict[str, float] = {}
-        for timer in self._timers:
-            for name, passed in timer.read().items():
-                milliseconds[name] = milliseconds.get(name, 0.0) + passed
-        return milliseconds

@@ -37,6 +37,11 @@ def checked_device(device: wp.DeviceLike) -> wp.Device:
         raise ValueError(f"device must be one of this machine, not {device!r}: {error}") from None
 
 
+def device_names(names: str | None) -> list:
+    """Returns the names of devices between commas; None for Warp's default."""
+    return [None] if names is None else names.split(",")
+
+
 def find_device(name: str | None) -> wp.Device:
     """Returns the Warp device of a name, Warp's preferred one for None.
 

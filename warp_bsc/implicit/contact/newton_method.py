@@ -433,15 +433,15 @@ class NewtonMethod:
         self._prepare_candidates()
 
     def _allocate_candidates(self, queues):
-        capacity, self._queues = sum(len(q.pairs) for q in queues), queues
         self._retire(self.problem.candidates)
-        sizes: dict = dict.fromkeys(
-            ("start", "room", "near", "far", "listed_edges", "listed_others"), self._work.worlds
-        )
+        of_worlds = "start", "room", "near", "far", "listed_edges", "listed_others"
+        sizes: dict = dict.fromkeys(of_worlds, self._work.worlds)
+        capacity = sum(len(q.pairs) for q in queues)
         sizes["used"] = 1
         sizes["kept"] = capacity if self.mesh.distances is not None else 0
         self.problem.candidates = allocate(Candidates, capacity, self._work.device, **sizes)
         self.problem.candidates.room.fill_(capacity)
+        self._queues = queues  # last: without memory, they are allocated again
 
     def allocate_contacts(self, of_room):
         """Allocates contacts, so many for each particle of a world, and more for each body."""

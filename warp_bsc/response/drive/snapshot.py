@@ -37,12 +37,18 @@ class Snapshot:
         saved: The copies, in the order of what is kept.
     """
 
-    def __init__(self, kept: Sequence[wp.array], worlds: Sequence[wp.array[int]] = ()):
+    def __init__(self, kept: Sequence[wp.array], *, worlds: Sequence[wp.array] = (), before: "Snapshot | None" = None):
         """Copies arrays, as they are now; :meth:`save` copies them again, and allocates nothing.
 
-        ``worlds`` has the worlds of the elements of each array, if it is ever to be restored by a mask.
+        ``worlds`` has the worlds of the elements of each array, if it is ever to be restored by a mask. The memory of a
+        snapshot ``before``, which then is of no use, is used again if its arrays are of the same shapes.
         """
-        self._kept, self._worlds, self.saved = kept, worlds, [wp.clone(x, requires_grad=False) for x in kept]
+        self._kept, self._worlds = kept, worlds
+        if before is not None and [(x.shape, x.dtype) for x in kept] == [(x.shape, x.dtype) for x in before.saved]:
+            self.saved = before.saved
+            self.save()
+        else:
+            self.saved = [wp.clone(x, requires_grad=False) for x in kept]
 
     def save(self) -> None:
         """Copies what they hold."""

@@ -249,8 +249,7 @@ class Style3DContacts:
         count = min(int(constraints.count.numpy()[0]), len(constraints.vertices))
         if self._keys is None or len(self._keys) < 2 * count:  # the constraints have grown
             size = 2 * len(constraints.vertices)  # half of it is space for the sort
-            self._keys = wp.empty(size, dtype=wp.uint64, device=work.device)
-            self._order = wp.empty(size, dtype=int, device=work.device)
+            self._keys, self._order = (wp.empty(size, dtype=kind, device=work.device) for kind in (wp.uint64, int))
         work.launch(_make_keys, count, [constraints], [self._keys, self._order])
         wp.utils.radix_sort_pairs(self._keys, self._order, count)
 

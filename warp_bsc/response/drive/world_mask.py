@@ -93,7 +93,7 @@ class WorldMask:
         """Allocates buffers for the inner solver, the workspace of steps, and their motion."""
         self._solver, self._work, self._motion = solver, work, motion
         model, device = motion.mesh.model, work.device
-        self._last = Snapshot(motion.last.arrays, motion.last.worlds)
+        self._last = Snapshot(motion.last.arrays, worlds=motion.last.worlds)
         self._held, of_vertices = _Held(), motion.vertices
         held = self._held
         last, held.planes, *_ = self._last.saved

@@ -1,8 +1,7 @@
 """Writes the results of a step by world."""
 
-from collections.abc import Callable
+from typing import Any
 
-import numpy as np
 import warp as wp
 
 from ..state.status import SolveStatus
@@ -114,13 +113,7 @@ class WorldCounter:
     """
 
     def __init__(
-        self,
-        work: Workspace,
-        results: StepResults,
-        *,
-        strain: wp.array[float],
-        find_inside: Callable[[], np.ndarray],
-        max_impulse: wp.array[float] | None = None,
+        self, work: Workspace, results: StepResults, *, strain: wp.array, find_inside: Any, max_impulse: wp.array | None
     ):
         """Allocates the results, and makes detections count by world; what is given is published with them."""
         self._work, self._results = work, results

@@ -11,6 +11,7 @@ from newton.viewer import ViewerBase
 
 from ..._arguments import check_instance, checked_number
 from ...detection.at_rest.intersections import find_intersections
+from ...detection.run.phase_timer import PhaseTimer
 from ..state.status import Result, views_of
 from ..state.structs import FROZEN, NOT_FINITE, TRUNCATED, UNCERTIFIED
 from ..state.workspace import Workspace
@@ -75,7 +76,7 @@ class SolverReport:
         self._forces: ContactReport | None = None
         self._worlds: Worlds | None = None
         self.coupled: Any = None  # the check of steps in the state of the program, of an entry of a coupled solver
-        self.spans: list[tuple] = []  # start and end of each substep of the last step, in seconds, or events on a GPU
+        self.timers: list[PhaseTimer] = []  # of each substep of the last step
 
     def copy_totals(self) -> None:
         """Copies the totals to the host, without waiting for the device, also in a CUDA graph."""
@@ -349,11 +350,7 @@ class SolverReport:
 
         Without the inner solver.
         """
-        if not self.spans:
-            return None
-        if isinstance(self.spans[0][0], wp.Event):
-            return sum(wp.get_event_elapsed_time(start, end) for start, end in self.spans)
-        return 1e3 * sum(end - start for start, end in self.spans)
+        return sum(sum(timer.read().values()) for timer in self.timers) if self.timers else None
 
     @property
     def strain(self) -> float:

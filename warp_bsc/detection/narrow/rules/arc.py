@@ -39,10 +39,8 @@ def allocate_arcs(body: np.ndarray, bodies: int, device: wp.Device, *, tolerance
     """
     arcs = Arcs()
     arcs.turning = wp.zeros(1, dtype=int, device=device)
-    arcs.body = wp.array(body, dtype=int, device=device)
-    arcs.rigid_id = wp.array(body, dtype=int, device=device)
-    arcs.centre = wp.zeros(bodies, dtype=wp.vec3d, device=device)
-    arcs.turn = wp.zeros(bodies, dtype=wp.vec3d, device=device)
+    arcs.body, arcs.rigid_id = (wp.array(body, dtype=int, device=device) for _ in range(2))
+    arcs.centre, arcs.turn = (wp.zeros(bodies, dtype=wp.vec3d, device=device) for _ in range(2))
     arcs.bounds = wp.zeros(len(body), dtype=wp.vec3d, device=device)
     arcs.deviation = wp.zeros(len(body), dtype=wp.float64, device=device)
     arcs.tolerance = tolerance
