@@ -18,7 +18,7 @@ from warp_bsc.repairing.shot.blend import BLEND, blend
 from warp_bsc.repairing.shot.findings import find_collisions
 from warp_bsc.repairing.shot.mesh_groups import groups_of
 from warp_bsc.repairing.shot.repair_shot import repair_shot
-from warp_bsc.repairing.shot.stretch import FollowedMesh, ShotFrame, StretchRecorder
+from warp_bsc.repairing.shot.stretch import ShotFrame, StretchRecorder
 from warp_bsc.usd.write.points_layer import MovedFrame
 
 
@@ -143,7 +143,7 @@ def test_an_edge_of_no_length_in_the_shot_does_not_wreck_a_frame(tmp_path, lengt
     x = given.copy()
     x[1] += np.float32((1.0 / SIZE, 0, 0))
     edges = np.array([(row * n + i, row * n + i + 1) for row in range(n) for i in range(SIZE)])
-    recorder = StretchRecorder(FollowedMesh(np.ones(len(given), bool), edges, 1.0 / SIZE))
+    recorder = StretchRecorder(np.ones(len(given), bool), edges, 1.0 / SIZE)
     moved = MovedFrame(0.0, False, None, np.array([1]), x[1:2].astype(np.float64))
     recorder.add(ShotFrame(given, x, x - given), moved)
     stretch = recorder.finish([])

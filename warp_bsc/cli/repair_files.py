@@ -21,7 +21,7 @@ from ..repairing.repair import repair
 from ..repairing.results import RepairResult
 from ..repairing.shot.findings import kept_meshes
 from ..repairing.shot.report import RepairPage
-from ..repairing.shot.stretch import FollowedMesh, ShotFrame, StretchRecorder
+from ..repairing.shot.stretch import ShotFrame, StretchRecorder
 from ..usd.write.points_layer import MovedFrame
 from .device import find_device, loading_kernels
 from .exit_status import ExitStatus
@@ -161,7 +161,7 @@ def _write_page(
         is_movable[segment.vertices_of(number)] = mesh.name not in kept
     edges = CollisionMesh(segment.faces, len(given), device=device).edges
     length = float(np.median(np.linalg.norm(given[edges[:, 0]] - given[edges[:, 1]], axis=1)))
-    recorder = StretchRecorder(FollowedMesh(is_movable, edges, length))
+    recorder = StretchRecorder(is_movable, edges, length)
     (vertices,) = np.nonzero((x != given).any(axis=1))
     moved = MovedFrame(time, False, segment, vertices, x[vertices].astype(np.float64))
     recorder.add(ShotFrame(given, x, x - given, result.certified), moved)

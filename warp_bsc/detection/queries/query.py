@@ -1,7 +1,7 @@
 """Elementary queries: many pairs of vertices, edges and faces at once, each given by its points."""
 
 from dataclasses import dataclass
-from typing import overload
+from typing import Any, Protocol, overload
 
 import numpy as np
 import warp as wp
@@ -48,26 +48,38 @@ class QueryResult:
     normal: np.ndarray | None
 
 
-@overload
-def query_vertex_face(
-    points: ArrayLike | wp.array,
-    *,
-    min_distance: ArrayLike = 0.0,
-    method: Method = "exact",
-    toi: bool = True,
-    tolerance: float = TOLERANCE,
-    device: wp.DeviceLike = None,
-    out: None = None,
-) -> QueryResult: ...
-@overload
-def query_vertex_face(
-    points: wp.array,
-    *,
-    method: Method = "exact",
-    toi: bool = True,
-    tolerance: float = TOLERANCE,
-    out: DeviceQueryResult,
-) -> DeviceQueryResult: ...
+class _Query(Protocol):
+    """The types of a query: with ``out``, its results are that."""
+
+    @overload
+    def __call__(
+        self,
+        points: ArrayLike | wp.array,
+        *,
+        min_distance: ArrayLike = 0.0,
+        method: Method = "exact",
+        toi: bool = True,
+        tolerance: float = TOLERANCE,
+        device: wp.DeviceLike = None,
+        out: None = None,
+    ) -> QueryResult: ...
+    @overload
+    def __call__(
+        self,
+        points: wp.array,
+        *,
+        method: Method = "exact",
+        toi: bool = True,
+        tolerance: float = TOLERANCE,
+        out: DeviceQueryResult,
+    ) -> DeviceQueryResult: ...
+
+
+def _typed(query: Any) -> _Query:
+    return query
+
+
+@_typed
 def query_vertex_face(
     points: ArrayLike | wp.array,
     *,
@@ -109,26 +121,7 @@ def query_vertex_face(
     return _query(PairKind.VERTEX_FACE, points, min_distance, method, toi, tolerance, device)
 
 
-@overload
-def query_edge_edge(
-    points: ArrayLike | wp.array,
-    *,
-    min_distance: ArrayLike = 0.0,
-    method: Method = "exact",
-    toi: bool = True,
-    tolerance: float = TOLERANCE,
-    device: wp.DeviceLike = None,
-    out: None = None,
-) -> QueryResult: ...
-@overload
-def query_edge_edge(
-    points: wp.array,
-    *,
-    method: Method = "exact",
-    toi: bool = True,
-    tolerance: float = TOLERANCE,
-    out: DeviceQueryResult,
-) -> DeviceQueryResult: ...
+@_typed
 def query_edge_edge(
     points: ArrayLike | wp.array,
     *,

@@ -15,7 +15,7 @@ from ..contacts import Contacts, as_contacts, projected
 from ..elastic import Springs
 from ..surface import Surface
 from .follow_kernels import find_directions, normalize, smooth
-from .stretch import SHORTEST_EDGE, ShotFrame
+from .stretch import ShotFrame, edge_ratios
 
 if TYPE_CHECKING:
     from .playback import Playback
@@ -44,8 +44,8 @@ _EARLIEST = 0.06
 """Time of a contact on an arc, as a share of the step: an earlier one is resolved as one at this time."""
 _STRAINED = 0.095
 """Strain of an edge, as a logarithm, from which on springs relax a frame, and twice what they leave."""
-_RELAXATIONS, _RELAXING_SWEEPS, _MOMENTUM = 16, 40, 0.8
-"""Detections, sweeps of the springs before each, and the momentum of these."""
+_RELAXATIONS, _RELAXING = 16, {"sweeps": 40, "slack": 0.5 * _STRAINED, "momentum": 0.8}
+"""Detections, and what springs do before each."""
 _FAILURES = 5
 """Detections with collisions after which the vertices that collide stay where they were."""
 _RINGS = 10
@@ -198,14 +198,7 @@ class Follower:
         displaced[known.vertices] = True
         moving, failures = (around := springs.around(displaced, _RINGS)), 0
         for _ in range(_RELAXATIONS):
-            x = springs.relax(
-                frame.x.astype(np.float64),
-                _RELAXING_SWEEPS,
-                0.5 * _STRAINED,
-                momentum=_MOMENTUM,
-                contacts=known,
-                around=moving,
-            )
+            x = springs.relax(frame.x.astype(np.float64), contacts=known, around=moving, **_RELAXING)
             x = self._moved_apart(x, frame.given, known, moving).astype(np.float32)
             changed, collide = (x != frame.x).any(axis=1) if is_free else self._is_movable, np.zeros_like(moving)
             for start, arcs in motions:
@@ -230,9 +223,7 @@ class Follower:
 
     def _strain(self, frame: ShotFrame) -> tuple[float, float]:
         """Returns the largest strain of an edge, as a logarithm, and the sum of what springs would relax of all."""
-        lengths = [np.linalg.norm(x[self.edges[:, 1]] - x[self.edges[:, 0]], axis=1) for x in (frame.x, frame.given)]
-        length, rest = (np.maximum(values, SHORTEST_EDGE * self.length) for values in lengths)
-        strains = np.abs(np.log(length / rest))
+        strains = np.abs(np.log(np.maximum(edge_ratios(frame, self.edges, self.length), 1e-9)))
         return float(strains.max(initial=0.0)), float(np.maximum(strains - 0.5 * _STRAINED, 0.0).sum())
 
     def near(self, contacts: Contacts, x: np.ndarray) -> Contacts:
@@ -256,8 +247,7 @@ class Follower:
 
         They are float64, or as they are if nothing moves.
         """
-        movable = self._is_movable if moving is None else moving
-        groups = self._surface.rigid
+        movable, groups = self._is_movable if moving is None else moving, self._surface.rigid
         vertices = groups.vertices
         for _ in range(_FITS if len(vertices) else 1):
             before = x
@@ -265,8 +255,7 @@ class Follower:
                 x = projected(~movable, x.astype(np.float64), known, _PROJECTIONS, device=self._device)
             if len(vertices):
                 x = groups.carried(x, given, (x != before).any(axis=1))
-                rounding = np.finfo(np.float32).eps * np.abs(x[vertices])
-                x = groups.placed(x, given, rounding)
+                x = groups.placed(x, given, np.finfo(np.float32).eps * np.abs(x[vertices]))
         return x
 
     def _contacts(self, start, target, changed, arcs) -> tuple[Contacts, np.ndarray]:

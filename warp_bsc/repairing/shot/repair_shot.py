@@ -21,7 +21,7 @@ from .blend import MARGIN, blend
 from .findings import Finding, kept_meshes, matching_meshes
 from .follow import Follower
 from .mesh_groups import groups_of
-from .stretch import FollowedMesh, RepairedStretch, ShotFrame, StretchRecorder
+from .stretch import RepairedStretch, ShotFrame, StretchRecorder
 
 _FADING = 0.7
 """Share of a displacement that the next frame begins with, while the displacements are sought."""
@@ -135,7 +135,7 @@ class _Shot:
         """
         interval = self._take_segment(first)
         last = self._span(first)[1]
-        if not self._mesh.is_movable.any():
+        if not self._is_movable.any():
             return None, stop
         reasons = []
         start = self._start(first, interval, reasons)
@@ -145,7 +145,7 @@ class _Shot:
             sought.append(_nonzero(frame.displacement))
         stop = min(last, max(stop, first + len(sought) - 1 + MARGIN))
         used, displacements = _joined(sought, stop - first + 1)
-        recorder = StretchRecorder(self._mesh)
+        recorder = self._recorder()
         frame, number = start, 0
         self._record(recorder, first, start, 0)
         frames = self._follow(first, stop, last, start, contacts, used, blend(displacements))
@@ -159,7 +159,7 @@ class _Shot:
         stretch = recorder.finish(reasons)
         if max_move is not None and stretch.largest_move > max_move:
             reason = f"kept as it is: a move of {stretch.largest_move:g} is needed, more than {max_move:g}"
-            recorder = StretchRecorder(self._mesh)
+            recorder = self._recorder()
             self._record(recorder, first, ShotFrame.of_shot(start.given), 0)
             stretch = replace(recorder.finish([reason]), end=self._scene.times[stop])
         return stretch, stop
@@ -198,7 +198,7 @@ class _Shot:
                 self._rigid[vertices] = connect_cells(mesh.edges, len(x))[vertices]
             options: dict[str, Any] = {"rigid": self._rigid, "min_distance": self._min_distance}
             self._follower = Follower(mesh, self._single(x), is_movable, **options)
-            self._mesh = FollowedMesh(is_movable, self._follower.edges, self._follower.length)
+            self._is_movable = is_movable
         return self._scene.interval(index)
 
     def _single(self, x) -> np.ndarray:
@@ -217,7 +217,7 @@ class _Shot:
         given = self._single(interval.x0)
         if not self._findings[first].crossings[0]:
             return ShotFrame.of_shot(given)
-        fixed, distance = ~self._mesh.is_movable, self._min_distance
+        fixed, distance = ~self._is_movable, self._min_distance
         result = repair(self._follower.mesh, given, fixed=fixed, rigid=self._rigid, min_distance=distance)
         if result.unresolved:
             pairs = sorted({" and ".join(dict.fromkeys(names)) for names in self._findings[first].crossing_meshes})
@@ -251,7 +251,7 @@ class _Shot:
             if displacements is None:
                 displacement = _FADING * frame.displacement
                 size = np.linalg.norm(displacement, axis=1, keepdims=True)
-                displacement = np.where(size < _FADED * self._mesh.length, np.float32(0.0), displacement)
+                displacement = np.where(size < _FADED * self._follower.length, np.float32(0.0), displacement)
             else:
                 displacement = np.zeros_like(given)
                 if index - first + 1 < len(displacements):
@@ -292,6 +292,9 @@ class _Shot:
                 window.pop(0)
                 yield window[0]
         yield from window[1:]
+
+    def _recorder(self) -> StretchRecorder:
+        return StretchRecorder(self._is_movable, self._follower.edges, self._follower.length)
 
     def _record(self, recorder, first, frame, number) -> None:
         """Adds the frame of a number, counted from that at the start of the first interval, to a stretch."""

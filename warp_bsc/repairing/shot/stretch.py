@@ -11,7 +11,7 @@ from ..contacts import Contacts
 _GOOD_EDGES = 1.0 / 3.0, 2.0
 """Smallest and largest length of an edge in a frame that is good, as shares of its length in the shot."""
 
-SHORTEST_EDGE = 1e-3
+_SHORTEST_EDGE = 1e-3
 """Length of an edge in the shot, as a share of the median one, up to which it does not count: when it moves at all, it
 is shorter or longer by any factor."""
 
@@ -94,26 +94,12 @@ class ShotFrame:
         return self.x is not self.given and not np.array_equal(self.x, self.given)
 
 
-@dataclass(frozen=True, eq=False)
-class FollowedMesh:
-    """The mesh of a stretch, as far as its numbers need it.
-
-    Attributes:
-        is_movable: Whether each vertex may be moved, bool, shape [vertex_count].
-        edges: Vertices of the edges of the movable part, shape [n, 2].
-        length: Median length of these.
-    """
-
-    is_movable: np.ndarray
-    edges: np.ndarray
-    length: float
-
-
 class StretchRecorder:
     """Collects the frames of a stretch, in order. It holds the moved vertices alone."""
 
-    def __init__(self, mesh: FollowedMesh):
-        self._mesh = mesh
+    def __init__(self, is_movable: np.ndarray, edges: np.ndarray, length: float):
+        """Begins without frames, given vertices that may move, bool, their edges, and the median length of these."""
+        self._is_movable, self._edges, self._length = is_movable, edges, length
         self._frames: list[MovedFrame] = []
         self._times: list[float] = []
         self._uncertified: list[float] = []
@@ -129,7 +115,7 @@ class StretchRecorder:
         if not frame.certified:
             self._uncertified.append(moved.time)
         added = frame.x - frame.given
-        own = frame.given[self._mesh.is_movable]
+        own = frame.given[self._is_movable]
         if len(self._last) == 2:
             (a, x), (b, y) = self._last
             differences = (_largest(a - 2.0 * b + added), _largest(x - 2.0 * y + own))
@@ -142,10 +128,7 @@ class StretchRecorder:
         self._moved = max(self._moved, len(moves))
         self._largest.append(float(moves.max()))
         self._sum, self._count = self._sum + float(moves.sum(dtype=np.float64)), self._count + len(moves)
-        edges = self._mesh.edges
-        lengths = [np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1) for x in (frame.x, frame.given)]
-        counts = lengths[1] > SHORTEST_EDGE * self._mesh.length
-        ratio = lengths[0][counts] / lengths[1][counts]
+        ratio = edge_ratios(frame, self._edges, self._length)
         self._ratios.append((float(ratio.min(initial=1.0)), float(ratio.max(initial=1.0))))
 
     def finish(self, reasons: list[str]) -> RepairedStretch:
@@ -158,12 +141,19 @@ class StretchRecorder:
             moved=self._moved,
             largest_move=max(self._largest, default=0.0),
             mean_move=self._sum / max(1, self._count),
-            edge_length=self._mesh.length,
+            edge_length=self._length,
             edge_ratios=tuple(self._ratios),
             acceleration=(self._acceleration[0], self._acceleration[1]),
             uncertified=tuple(self._uncertified),
             reasons=tuple(reasons),
         )
+
+
+def edge_ratios(frame: ShotFrame, edges: np.ndarray, length: float) -> np.ndarray:
+    """Returns the lengths of edges as shares of those in the shot, of all that count by the median ``length``."""
+    lengths, rest = (np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1) for x in (frame.x, frame.given))
+    counts = rest > _SHORTEST_EDGE * length
+    return lengths[counts] / rest[counts]
 
 
 def distortion(ends: tuple[float, float]) -> float:
