@@ -14,7 +14,7 @@ from .inversions import Inversions, inversions_of_motion
 from .mesh import CollisionMesh
 from .pipeline import DetectionPipeline
 from .results.collision_finder import CollisionFinder
-from .results.collisions import Candidates, CapturedCollisions, Collisions, FreeStep
+from .results.collisions import Candidates, CapturedCollisions, Collisions, DetectionStats, FreeStep, PhaseCounts
 from .run.host_function import run_on_host
 from .run.launch import retry_until_fits
 from .run.settings import TOLERANCE, Method, PairKind
@@ -137,6 +137,29 @@ class CollisionDetector:
             return self._arcs.find(arcs, x0, x1, changed)
         self._has_run = True
         return self._finder.find(x0, x1, changed=changed)
+
+    @one_at_a_time
+    def stats_by_world(self, collisions: Collisions) -> list[DetectionStats] | None:
+        """Returns the counts of the last detection in each world of a mesh of faces, and equal shares of its times.
+
+        They are not known, None, if the exponents of a pair are too far apart for two limbs.
+
+        Args:
+            collisions: The result of that detection, without ``rigid_motion``.
+        """
+        pipeline, mesh = self._pipeline, self.mesh
+        if any(counts.too_wide_2 for counts in pipeline.counts.pairs.values()):
+            return None
+        assert mesh.world is not None
+        count = int(mesh.world.max()) + 1
+        vertices = pipeline.vertex_face.counts_by_world(mesh.world, count)
+        edges = pipeline.edge_edge.counts_by_world(mesh.world[mesh.edges[:, 0]], count)
+        shares = {name: value / count for name, value in collisions.stats.milliseconds.items()}
+        exact, none = self.method == "exact", PhaseCounts()
+        return [
+            DetectionStats(PhaseCounts.of(one, exact=exact), PhaseCounts.of(other, exact=exact), none, none, shares)
+            for one, other in zip(vertices, edges, strict=True)
+        ]
 
     @one_at_a_time
     def collision_free_step(self, x0: ArrayLike | wp.array, x1: ArrayLike | wp.array) -> FreeStep:

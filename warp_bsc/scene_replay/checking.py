@@ -3,11 +3,13 @@
 While the results of one interval are named, the next one is detected (on a CPU) and the one after it is read.
 """
 
+import itertools
 import math
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import Generic, Literal, TypeVar
+from itertools import pairwise
+from typing import Literal, TypeVar
 
 import numpy as np
 
@@ -18,23 +20,26 @@ from ..detection.at_rest.proximities import Proximities, ProximityFinder
 from ..detection.detector import CollisionDetector
 from ..detection.inversions import Inversions
 from ..detection.mesh import CollisionMesh
-from ..detection.results.collisions import Collisions, add_stats
+from ..detection.results.collisions import Collisions, DetectionStats, add_stats
 from ..detection.run.settings import Method
 from ..detection.run.start import is_cpu
-from ..usd.interval import Interval
+from ..usd.interval import Interval, positions_of
 from ..usd.scene import Scene
 from ..usd.segment import Segment
 from ..usd.selection import Selection
 from .duplicates import Duplicates
-from .results import IntervalResult, Work, summarize, summarize_intersections, summarize_inversions
+from .results import IntervalResult, Work, summarize, summarize_inversions
 from .scene_arcs import arcs_of
 from .scene_contacts import compare_contacts, find_contacts, join_contacts
-from .scene_intersections import SceneIntersections, name_intersections
+from .scene_intersections import AtTime, SceneIntersections, name_intersections
 from .scene_proximities import SceneProximities, name_proximities
 from .threads import read_ahead
 from .validation import validate
 
-_Found = TypeVar("_Found")
+_Found, _Named = TypeVar("_Found"), TypeVar("_Named", SceneIntersections, SceneProximities)
+
+_FACES_AT_ONCE = 30_000
+"""Number of faces of all copies of a segment, of which as many as intervals are detected at once."""
 
 
 @dataclass(frozen=True)
@@ -82,17 +87,18 @@ class IntervalChecker:
         detections = self._detect(first, stop, time.monotonic() + seconds)
         if is_cpu(self._checks.device):
             detections = read_ahead(detections)
-        for work, namer, detection in detections:
+        for works, namer, detection in detections:
             started = time.perf_counter()
-            result = namer.name(detection)
-            yield replace(result, work=replace(work, checking=work.checking + time.perf_counter() - started))
+            results = namer.name(detection)
+            share = (time.perf_counter() - started) / len(results)
+            for work, result in zip(works, results, strict=True):
+                yield replace(result, work=replace(work, checking=work.checking + share))
 
     def selection_without_initial(self) -> Selection:
         """Returns the selection that also ignores the pairs that cross, or are inside each other, at the first time."""
         interval = self.scene.interval(0)
         detector, namer = self._at(interval)
-        found = detector.find_intersections(interval.x0, interval.start)
-        found = summarize_intersections(namer.name_intersections(found, interval.x0, interval.start))
+        found = namer.name_at_start(detector.find_intersections(interval)).summary
         crossing = {(min(names), max(names)) for names, (crossings, _) in found.mesh_pairs.items() if crossings}
         selection = self._checks.selection
         return replace(
@@ -101,13 +107,33 @@ class IntervalChecker:
             ignored_inside=selection.ignored_inside | found.inside.keys(),
         )
 
-    def _detect(self, first: int, stop: int, deadline: float) -> Iterator[tuple[Work, "_SegmentNamer", "_Detection"]]:
-        """Yields the work on some intervals, the namers of their segments, and what is detected in them."""
-        for reading, interval in read_ahead(_timed(self.scene.intervals(first, stop), deadline)):
+    def _detect(
+        self, first: int, stop: int, deadline: float
+    ) -> Iterator[tuple[list[Work], "_SegmentNamer", "_Detection"]]:
+        """Yields the work on some intervals, the namer of their segment, and what is detected in them."""
+        for batch in read_ahead(self._batches(_timed(self.scene.intervals(first, stop), deadline))):
             started = time.perf_counter()
-            detector, namer = self._at(interval)
-            detection = detector.detect(interval)
-            yield Work(self._worker, detector.device, reading, time.perf_counter() - started), namer, detection
+            detector, namer = self._at(batch[0][1])
+            for detection in detector.detect([interval for _, interval in batch]):
+                share = (time.perf_counter() - started) / len(batch)
+                works = [Work(self._worker, detector.device, reading, share) for reading, _ in batch]
+                yield works[: len(detection.intervals)], namer, detection
+                del batch[: len(detection.intervals)]
+
+    def _batches(self, intervals: Iterable[tuple[float, Interval]]) -> Iterator[list[tuple[float, Interval]]]:
+        """Yields intervals, with the time to read each, in groups that are detected at once."""
+        batch: list[tuple[float, Interval]] = []
+        for reading, interval in intervals:
+            alone = _is_alone(interval, self._checks)
+            if batch and (alone or interval.segment is not batch[0][1].segment):
+                yield batch
+                batch = []
+            batch = [*batch, (reading, interval)]
+            if alone or len(batch) * len(interval.segment.faces) > _FACES_AT_ONCE - len(interval.segment.faces):
+                yield batch
+                batch = []
+        if batch:
+            yield batch
 
     def _at(self, interval: Interval) -> tuple["_SegmentDetector", "_SegmentNamer"]:
         if self._of_segment is None or interval.segment is not self._of_segment[1].segment:
@@ -119,40 +145,56 @@ class IntervalChecker:
 
 @dataclass(frozen=True)
 class _Detection:
-    """The collisions, intersections and proximities that are detected in an interval.
+    """The collisions, intersections and proximities that are detected in intervals of a segment.
 
     Attributes:
-        interval: The interval.
+        intervals: The intervals.
         arcs: The motion of vertices on arcs; None if all move straight.
-        collisions: Collisions of meshes.
+        mesh: The mesh, with a copy of the meshes of the segment for each interval.
+        collisions: Collisions of that mesh.
+        stats: Counts and times of each interval.
         of_strands: Collisions of curves and points; None without any.
-        intersections: Intersections at the start and at the end; None if they are not checked.
-        proximities: Proximities at the start and at the end; None if they are not checked.
-        inversions: The tetrahedra that invert; None without any tetrahedra.
+        intersections: Intersections at the start and at the end of each interval; None if they are not checked.
+        proximities: Proximities at both times; None if they are not checked.
+        inversions: The tetrahedra that invert in each interval; None without any tetrahedra.
         detector: The detector of the collisions of meshes if they are validated, else None.
     """
 
-    interval: Interval
+    intervals: list[Interval]
     arcs: RigidMotion | None
+    mesh: CollisionMesh
     collisions: Collisions
+    stats: list[DetectionStats]
     of_strands: Collisions | None
-    intersections: tuple[Intersections, Intersections] | None
-    proximities: tuple[Proximities, Proximities] | None
-    inversions: Inversions | None
+    intersections: list[tuple[AtTime[Intersections], AtTime[Intersections]]] | None
+    proximities: list[tuple[AtTime[Proximities], AtTime[Proximities]]] | None
+    inversions: list[Inversions] | None
     detector: CollisionDetector | None
 
 
-@dataclass(frozen=True)
-class _At(Generic[_Found]):
-    """Intersections or proximities of one time, kept for the interval that starts then."""
+class _Copies:
+    """The meshes of a segment, once for each of some intervals, which are detected at once: each copy is a world."""
 
-    time: float
-    x: np.ndarray
-    found: _Found
+    def __init__(self, segment: Segment, checks: Checks, count: int):
+        self.count = count
+        faces, world = segment.faces, None
+        if count > 1:
+            faces = (faces + segment.vertex_count * np.arange(count)[:, None, None]).reshape(-1, 3)
+            world = np.repeat(np.arange(count), segment.vertex_count)
+        self.mesh = CollisionMesh(faces, count * segment.vertex_count, world=world, device=checks.device)
+        self.detector = CollisionDetector(self.mesh, method=checks.method)
+        self.finder = self.detector.intersection_finder() if checks.intersections else None
 
-    def is_at(self, x: np.ndarray, time: float) -> bool:
-        """Returns whether they are of a time and of positions."""
-        return self.time == time and (self.x is x or np.array_equal(self.x, x))
+    def find_intersections(self, x: np.ndarray, *, is_end: bool = False) -> list[Intersections]:
+        """Returns the intersections of each copy, given the positions of all; see :meth:`.IntersectionFinder.find`."""
+        assert self.finder
+        found = self.finder.find(x, is_end=is_end)
+        sizes = np.array([len(self.mesh.edges), len(self.mesh.faces)], dtype=np.int32) // self.count
+        bounds = np.searchsorted(found.pairs[:, 0], sizes[0] * np.arange(self.count + 1)).tolist()
+        return [
+            Intersections(found.pairs[a:b] - number * sizes, found.crosses[a:b])
+            for number, (a, b) in enumerate(pairwise(bounds))
+        ]
 
 
 class _SegmentDetector:
@@ -165,72 +207,105 @@ class _SegmentDetector:
     """
 
     def __init__(self, segment: Segment, checks: Checks):
-        self._is_validated = checks.validate != 0
-        self.mesh = CollisionMesh(segment.faces, segment.vertex_count, device=checks.device)
+        self._segment, self._checks = segment, checks
+        self._alone = self._copies = _Copies(segment, checks, 1)
+        self.mesh = self._alone.mesh
         self.device = self.mesh.device.alias
-        self._detector = CollisionDetector(self.mesh, method=checks.method)
         self.strands = _StrandChecker(segment, checks) if segment.has_strands else None
-        self._finder = self._detector.intersection_finder() if checks.intersections else None
-        self._intersections: _At[tuple[Intersections, Intersections]] | None = None  # of meshes, and of all
+        self._of_meshes: Intersections | None = None  # found last, those of meshes alone
+        self._intersections: AtTime[Intersections] | None = None  # and all
         tets, self._inversions = segment.tetrahedra, None
         if len(tets.corners):
             mesh = CollisionMesh(np.empty((0, 3), int), tets.vertex_count, tets=tets.corners, device=checks.device)
             self._inversions = CollisionDetector(mesh, method=checks.method)
         clearance = checks.clearance
         self._proximity_finder = None if clearance is None else ProximityFinder(self.mesh, clearance)
-        self._proximities: _At[Proximities] | None = None
+        self._proximities: AtTime[Proximities] | None = None
 
-    def detect(self, interval: Interval) -> _Detection:
-        """Returns the detected collisions, intersections and proximities of an interval."""
-        detector, arcs = self._detector, arcs_of(interval)
-        start = self.find_intersections(interval.x0, interval.start) if self._finder else None
+    def detect(self, intervals: list[Interval]) -> Iterator[_Detection]:
+        """Yields what is detected in intervals: in all at once, or one by one if the counts of each are not known."""
+        if len(intervals) not in (1, self._copies.count):
+            self._copies = _Copies(self._segment, self._checks, len(intervals))
+        copies = self._alone if len(intervals) == 1 else self._copies
+        interval, detector, (x0, x1) = intervals[0], copies.detector, positions_of(intervals)
+        arcs, starts = arcs_of(interval), []
+        for number, one in enumerate(intervals):
+            before = intervals[number - 1]
+            is_joined = number > 0 and AtTime(before.end, before.x1, None).is_at(one.x0, one.start)
+            starts.append(None if is_joined or not copies.finder else self.find_intersections(one))
         if interval.is_at_rest:  # at rest, coplanar faces would be many collisions between obstacles
             nothing = CollisionMesh(np.empty((0, 3), int), 0, device=self.mesh.device)
             detector = CollisionDetector(nothing, method=detector.method)
             collisions = detector.detect(np.zeros((0, 3)), np.zeros((0, 3)))
         else:
-            collisions = detector.detect(interval.x0, interval.x1, rigid_motion=arcs)
+            collisions = detector.detect(x0, x1, rigid_motion=arcs)
+        stats = [collisions.stats] if len(intervals) == 1 else detector.stats_by_world(collisions)
+        if stats is None:
+            for one in intervals:
+                yield from self.detect([one])
+            return
         of_strands = self.strands.detect(interval, arcs) if self.strands and not interval.is_at_rest else None
         intersections = None
-        if start:
-            motion = None if interval.is_at_rest or arcs else collisions
-            intersections = start, self.find_intersections(interval.x1, interval.end, motion)
+        if copies.finder:
+            ends = self._find_at_ends(intervals, x1, copies, None if interval.is_at_rest or arcs else collisions)
+            intersections = [(start or ends[number - 1], ends[number]) for number, start in enumerate(starts)]
         proximities = None
         if self._proximity_finder:
-            at_start = self._find_proximities(interval.x0, interval.start)
-            proximities = at_start, self._find_proximities(interval.x1, interval.end)
-        inversions = self._inversions and self._inversions.inversions(*interval.tet_positions)
-        validated = detector if self._is_validated else None
-        return _Detection(interval, arcs, collisions, of_strands, intersections, proximities, inversions, validated)
+            proximities = [
+                (self._find_proximities(one.x0, one.start), self._find_proximities(one.x1, one.end))
+                for one in intervals
+            ]
+        inversions = None
+        if self._inversions:
+            inversions = [self._inversions.inversions(*one.tet_positions) for one in intervals]
+        validated = detector if self._checks.validate != 0 else None
+        found = intersections, proximities, inversions
+        yield _Detection(intervals, arcs, copies.mesh, collisions, stats, of_strands, *found, validated)
 
-    def find_intersections(self, x: np.ndarray, time: float, collisions: Collisions | None = None) -> Intersections:
-        """Returns the intersections at a time; those found last, if they are of that time.
+    def find_intersections(self, interval: Interval) -> AtTime[Intersections]:
+        """Returns the intersections at the start of an interval; those found last, if they are of that time."""
+        if self._intersections is None or not self._intersections.is_at(interval.x0, interval.start):
+            (found,) = self._alone.find_intersections(interval.x0)
+            return self._keep(found, interval.x0, interval.start)
+        return self._intersections
+
+    def _find_at_ends(
+        self, intervals: list[Interval], x1: np.ndarray, copies: _Copies, motion: Collisions | None
+    ) -> list[AtTime[Intersections]]:
+        """Returns the intersections at the ends of intervals, given the collisions that have just been detected."""
+        interval, last = intervals[0], self._intersections
+        assert last and self._of_meshes and copies.finder
+        if len(intervals) == 1 and last.is_at(x1, interval.end):
+            return [last]
+        if len(intervals) == 1 and motion:
+            found = [copies.finder.find_at_end(x1, self._of_meshes, motion)]
+        else:
+            found = copies.find_intersections(x1, is_end=motion is not None)
+        return [self._keep(one, at.x1, at.end, motion) for one, at in zip(found, intervals, strict=True)]
+
+    def _keep(
+        self, found: Intersections, x: np.ndarray, time: float, motion: Collisions | None = None
+    ) -> AtTime[Intersections]:
+        """Keeps intersections of meshes as those found last, and returns them with those of curves.
 
         Args:
+            found: The intersections.
             x: Positions at that time, shape [vertex_count, 3].
             time: Time code.
-            collisions: Those of the motion to these positions from the positions of the intersections found last, if
-                it has just been detected; else None.
+            motion: The collisions of the motion to these positions, if it has just been detected; else None.
         """
-        last = self._intersections
-        if last is None or not last.is_at(x, time):
-            assert self._finder
-            if last and collisions:
-                of_meshes = self._finder.find_at_end(x, last.found[0], collisions)
-            else:
-                of_meshes = self._finder.find(x)
-            found = of_meshes
-            if self.strands:
-                found = self.strands.with_intersections(of_meshes, x, is_end=collisions is not None)
-            self._intersections = last = _At(time, x, (of_meshes, found))
-        return last.found[1]
+        self._of_meshes = found
+        if self.strands:
+            found = self.strands.with_intersections(found, x, is_end=motion is not None)
+        self._intersections = AtTime(time, x, found)
+        return self._intersections
 
-    def _find_proximities(self, x: np.ndarray, time: float) -> Proximities:
+    def _find_proximities(self, x: np.ndarray, time: float) -> AtTime[Proximities]:
         """Returns the proximities at a time; those found last, if they are of that time."""
         if self._proximities is None or not self._proximities.is_at(x, time):
             assert self._proximity_finder
-            self._proximities = _At(time, x, self._proximity_finder.find(x))
-        return self._proximities.found
+            self._proximities = AtTime(time, x, self._proximity_finder.find(x))
+        return self._proximities
 
 
 class _SegmentNamer:
@@ -248,81 +323,87 @@ class _SegmentNamer:
             bodies = self._duplicates.without_twins(bodies)
             self._containment = ContainmentFinder(self._strand_mesh or self._mesh, bodies)
         self._named_duplicates = self._duplicates.named(checks.selection) if self._duplicates else ()
-        self._intersections: tuple[Intersections, SceneIntersections] | None = None  # those named last
-        self._proximities: tuple[Proximities, SceneProximities] | None = None
+        self._intersections: dict[AtTime, SceneIntersections] = {}  # those named last
+        self._proximities: dict[AtTime, SceneProximities] = {}
 
-    def name(self, detection: _Detection) -> IntervalResult:
-        """Returns the result of an interval."""
-        interval, collisions, selection = detection.interval, detection.collisions, self._checks.selection
-        intersections = proximities = None
-        if detection.intersections:
-            start, end = detection.intersections
-            named = self.name_intersections(start, interval.x0, interval.start)
-            intersections = named, self.name_intersections(end, interval.x1, interval.end)
-        if detection.proximities:
-            start, end = detection.proximities
-            proximities = self._name_proximities(start, interval.start), self._name_proximities(end, interval.end)
-        contacts = find_contacts(interval, self._mesh, collisions, selection, detection.arcs)
-        certified, stats = collisions.certified, collisions.stats
+    def name(self, detection: _Detection) -> list[IntervalResult]:
+        """Returns the results of intervals."""
+        intervals, collisions, arcs = detection.intervals, detection.collisions, detection.arcs
+        selection, inversions = self._checks.selection, detection.inversions
+        intersections = _named(self._intersections, detection.intersections, self._name_intersections)
+        proximities = _named(self._proximities, detection.proximities, self._name_proximities)
+        contacts = find_contacts(intervals, detection.mesh, collisions, selection, arcs)
+        certified, stats = collisions.certified, detection.stats
         if detection.of_strands:
             assert self._strand_mesh
-            more = find_contacts(interval, self._strand_mesh, detection.of_strands, selection, detection.arcs)
-            contacts, stats = join_contacts(contacts, more), add_stats(stats, detection.of_strands.stats)
+            more = find_contacts(intervals, self._strand_mesh, detection.of_strands, selection, arcs)
+            contacts, stats = [join_contacts(*contacts, *more)], [add_stats(*stats, detection.of_strands.stats)]
             certified &= detection.of_strands.certified
+        results = []
         if intersections:
-            contacts = compare_contacts(contacts, *intersections)
-        validation = None
-        if detection.detector:
-            validation = validate(
-                detection.detector,
-                collisions,
-                interval.x0,
-                interval.x1,
-                most=None if self._checks.validate == "all" else self._checks.validate,
-                seed=interval.index,
-                counted=contacts.counted,
-                turns=None if detection.arcs is None else detection.arcs.body >= 0,
-            )
-        summary = summarize(
-            contacts,
-            intersections,
-            proximities,
-            certified=certified,
-            stats=stats,
-            validation=validation,
-            duplicates=self._named_duplicates,
-            inverted=summarize_inversions(detection.inversions, interval) if detection.inversions else (),
-        )
-        return IntervalResult(summary, contacts, intersections, proximities, None)
-
-    def name_intersections(self, found: Intersections, x: np.ndarray, time: float) -> SceneIntersections:
-        """Returns the named intersections of a time, with the parts inside meshes; those named last, if the same.
-
-        Arguments are those of :func:`.scene_intersections.name_intersections`.
-        """
-        if self._intersections is None or self._intersections[0] is not found:
-            assert self._containment and self._duplicates
-            selection, meshes = self._checks.selection, self.segment.meshes
-
-            def are_checked(pairs: np.ndarray) -> np.ndarray:
-                ignored = selection.ignored_pairs(meshes, pairs) | selection.may_be_inside(meshes, pairs)
-                return selection.counted_pairs(meshes, pairs) & ~ignored
-
-            inside = self._containment.find(x, found, self._duplicates.may_be_checked(are_checked))
-            inside = self._duplicates.with_twins(inside, are_checked)
-            mesh = self._strand_mesh or self._mesh
-            self._intersections = (
+            contacts = compare_contacts(contacts, intersections)
+        for number, (interval, found) in enumerate(zip(intervals, contacts, strict=True)):
+            validation = None
+            if detection.detector:
+                validation = validate(
+                    detection.detector,
+                    collisions,
+                    interval.x0,
+                    interval.x1,
+                    most=None if self._checks.validate == "all" else self._checks.validate,
+                    seed=interval.index,
+                    counted=found.counted,
+                    turns=None if arcs is None else arcs.body >= 0,
+                )
+            at_rest = intersections and intersections[number], proximities and proximities[number]
+            summary = summarize(
                 found,
-                name_intersections(self.segment, mesh, found, inside, x, time, selection),
+                *at_rest,
+                certified=certified,
+                stats=stats[number],
+                validation=validation,
+                duplicates=self._named_duplicates,
+                inverted=summarize_inversions(inversions[number], interval) if inversions else (),
             )
-        return self._intersections[1]
+            results.append(IntervalResult(summary, found, *at_rest, None))
+        return results
 
-    def _name_proximities(self, found: Proximities, time: float) -> SceneProximities:
-        """Returns the named proximities of a time; those named last, if the same."""
-        if self._proximities is None or self._proximities[0] is not found:
-            named = name_proximities(self.segment, self._mesh, found, time, self._checks.selection)
-            self._proximities = found, named
-        return self._proximities[1]
+    def name_at_start(self, found: AtTime[Intersections]) -> SceneIntersections:
+        """Returns the named intersections of a time, with the parts inside meshes."""
+        return self._name_intersections([found])[0]
+
+    def _name_intersections(self, found: list[AtTime[Intersections]]) -> list[SceneIntersections]:
+        assert self._containment and self._duplicates
+        selection, meshes = self._checks.selection, self.segment.meshes
+
+        def are_checked(pairs: np.ndarray) -> np.ndarray:
+            ignored = selection.ignored_pairs(meshes, pairs) | selection.may_be_inside(meshes, pairs)
+            return selection.counted_pairs(meshes, pairs) & ~ignored
+
+        is_sought = self._duplicates.may_be_checked(are_checked)
+        inside = [self._containment.find(at.x, at.found, is_sought) for at in found]
+        inside = [self._duplicates.with_twins(one, are_checked) for one in inside]
+        return name_intersections(self.segment, self._strand_mesh or self._mesh, found, inside, selection)
+
+    def _name_proximities(self, found: list[AtTime[Proximities]]) -> list[SceneProximities]:
+        selection = self._checks.selection
+        return [name_proximities(self.segment, self._mesh, at.found, at.time, selection) for at in found]
+
+
+def _named(
+    known: dict[AtTime[_Found], _Named],
+    found: list[tuple[AtTime[_Found], AtTime[_Found]]] | None,
+    name: Callable[[list[AtTime[_Found]]], list[_Named]],
+) -> list[tuple[_Named, _Named]] | None:
+    """Returns findings at both times of intervals with names; keeps those of the last time, and names what is new."""
+    if found is None:
+        return None
+    new = [at for at in dict.fromkeys(itertools.chain(*found)) if at not in known]
+    known.update(zip(new, name(new) if new else [], strict=True))
+    named = [(known[start], known[end]) for start, end in found]
+    known.clear()
+    known[found[-1][1]] = named[-1][1]
+    return named
 
 
 class _StrandChecker:
@@ -372,6 +453,11 @@ class _StrandChecker:
         more = self._finder.find(x, is_end=is_end)
         own = np.stack([self._edges_of_faces[found.pairs[:, 0]], found.pairs[:, 1]], axis=1)
         return Intersections(np.concatenate([own, more.pairs]), np.concatenate([found.crosses, more.crosses]))
+
+
+def _is_alone(interval: Interval, checks: Checks) -> bool:
+    """Returns whether an interval is detected by itself: without motion, with turns, or with more than meshes."""
+    return interval.is_at_rest or bool(interval.turns) or interval.segment.has_strands or checks.validate != 0
 
 
 def _timed(intervals: Iterable[Interval], deadline: float) -> Iterator[tuple[float, Interval]]:

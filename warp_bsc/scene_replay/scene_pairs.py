@@ -1,6 +1,7 @@
 """Pairs of elements of a scene's meshes, in the prims' own numbers."""
 
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import ClassVar, Self
 
 import numpy as np
@@ -217,6 +218,16 @@ def name_elements(
 def take_rows(arrays: dict[str, np.ndarray], which: np.ndarray) -> dict[str, np.ndarray]:
     """Returns some rows of arrays, given which, bool; the arrays themselves for all rows."""
     return arrays if which.all() else {name: array[which] for name, array in arrays.items()}
+
+
+def split_rows(arrays: dict[str, np.ndarray], copies: np.ndarray, count: int) -> list[dict[str, np.ndarray]]:
+    """Returns the rows of arrays that belong to each of some copies, given the copy of each row, in their order."""
+    if count == 1:
+        return [arrays]
+    order = np.argsort(copies, kind="stable")
+    bounds = np.searchsorted(copies[order], np.arange(count + 1)).tolist()
+    ordered = {name: array[order] for name, array in arrays.items()}
+    return [{name: array[a:b] for name, array in ordered.items()} for a, b in pairwise(bounds)]
 
 
 def are_stiff_pairs(segment: Segment, vertices: np.ndarray, face_meshes: np.ndarray, ends: np.ndarray) -> np.ndarray:

@@ -1,6 +1,6 @@
 """The motion of a scene from one of its times to the next, and what reading it reveals, in notes and warnings."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -146,6 +146,13 @@ class Interval:
             *map(message_warning, self.notes.messages),
             *(jump_warning(name, [self.start]) for name in self.jumps),
         )
+
+
+def positions_of(intervals: Sequence[Interval]) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the positions at the starts of intervals of one segment, one after the other, and those at the ends."""
+    if len(intervals) == 1:
+        return intervals[0].x0, intervals[0].x1
+    return np.concatenate([at.x0 for at in intervals]), np.concatenate([at.x1 for at in intervals])
 
 
 def left_out_warning(reason: str) -> str:
