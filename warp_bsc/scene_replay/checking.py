@@ -3,13 +3,12 @@
 While the results of one interval are named, the next one is detected (on a CPU) and the one after it is read.
 """
 
-import itertools
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Literal, TypeVar
+from typing import Literal
 
 import numpy as np
 
@@ -31,12 +30,10 @@ from .duplicates import Duplicates
 from .results import IntervalResult, Work, summarize, summarize_inversions
 from .scene_arcs import arcs_of
 from .scene_contacts import compare_contacts, find_contacts, join_contacts
-from .scene_intersections import AtTime, SceneIntersections, name_intersections
+from .scene_intersections import SceneIntersections, name_intersections
 from .scene_proximities import SceneProximities, name_proximities
 from .threads import read_ahead
 from .validation import validate
-
-_Found, _Named = TypeVar("_Found"), TypeVar("_Named", SceneIntersections, SceneProximities)
 
 _FACES_AT_ONCE = 30_000
 """Number of faces of all copies of a segment, of which as many as intervals are detected at once."""
@@ -98,7 +95,11 @@ class IntervalChecker:
         """Returns the selection that also ignores the pairs that cross, or are inside each other, at the first time."""
         interval = self.scene.interval(0)
         detector, namer = self._at(interval)
-        found = namer.name_at_start(detector.find_intersections(interval)).summary
+        moment = _Moment(interval.start, interval.x0)
+        detector.find_at([moment])
+        namer.name_at([moment])
+        assert moment.intersections is not None
+        found = moment.intersections.summary
         crossing = {(min(names), max(names)) for names, (crossings, _) in found.mesh_pairs.items() if crossings}
         selection = self._checks.selection
         return replace(
@@ -111,7 +112,7 @@ class IntervalChecker:
         self, first: int, stop: int, deadline: float
     ) -> Iterator[tuple[list[Work], "_SegmentNamer", "_Detection"]]:
         """Yields the work on some intervals, the namer of their segment, and what is detected in them."""
-        for batch in read_ahead(self._batches(_timed(self.scene.intervals(first, stop), deadline))):
+        for batch in read_ahead(_batches(_timed(self.scene.intervals(first, stop), deadline), self._checks)):
             started = time.perf_counter()
             detector, namer = self._at(batch[0][1])
             for detection in detector.detect([interval for _, interval in batch]):
@@ -119,21 +120,6 @@ class IntervalChecker:
                 works = [Work(self._worker, detector.device, reading, share) for reading, _ in batch]
                 yield works[: len(detection.intervals)], namer, detection
                 del batch[: len(detection.intervals)]
-
-    def _batches(self, intervals: Iterable[tuple[float, Interval]]) -> Iterator[list[tuple[float, Interval]]]:
-        """Yields intervals, with the time to read each, in groups that are detected at once."""
-        batch: list[tuple[float, Interval]] = []
-        for reading, interval in intervals:
-            alone = _is_alone(interval, self._checks)
-            if batch and (alone or interval.segment is not batch[0][1].segment):
-                yield batch
-                batch = []
-            batch = [*batch, (reading, interval)]
-            if alone or len(batch) * len(interval.segment.faces) > _FACES_AT_ONCE - len(interval.segment.faces):
-                yield batch
-                batch = []
-        if batch:
-            yield batch
 
     def _at(self, interval: Interval) -> tuple["_SegmentDetector", "_SegmentNamer"]:
         if self._of_segment is None or interval.segment is not self._of_segment[1].segment:
@@ -143,41 +129,63 @@ class IntervalChecker:
         return self._of_segment
 
 
+@dataclass(eq=False)
+class _Moment:
+    """A time, and what is found and named there, kept for the interval that starts then.
+
+    Attributes:
+        time: Time code.
+        x: Positions of all vertices, shape [vertex_count, 3].
+        of_meshes: The intersections of meshes alone.
+        found: The intersections.
+        near: The proximities.
+        intersections: The intersections, named.
+        proximities: The proximities, named.
+    """
+
+    time: float
+    x: np.ndarray
+    of_meshes: Intersections | None = None
+    found: Intersections | None = None
+    near: Proximities | None = None
+    intersections: SceneIntersections | None = None
+    proximities: SceneProximities | None = None
+
+    def is_at(self, x: np.ndarray, time: float) -> bool:
+        """Returns whether it is of a time and of positions."""
+        return self.time == time and (self.x is x or np.array_equal(self.x, x))
+
+
 @dataclass(frozen=True)
 class _Detection:
-    """The collisions, intersections and proximities that are detected in intervals of a segment.
+    """What is detected in intervals of a segment.
 
     Attributes:
         intervals: The intervals.
+        moments: The start and the end of each, with intersections and proximities if these are checked.
         arcs: The motion of vertices on arcs; None if all move straight.
-        mesh: The mesh, with a copy of the meshes of the segment for each interval.
+        detector: The detector, whose mesh has a copy of the segment's meshes for each interval.
         collisions: Collisions of that mesh.
-        stats: Counts and times of each interval.
+        stats: Counts of each interval.
         of_strands: Collisions of curves and points; None without any.
-        intersections: Intersections at the start and at the end of each interval; None if they are not checked.
-        proximities: Proximities at both times; None if they are not checked.
-        inversions: The tetrahedra that invert in each interval; None without any tetrahedra.
-        detector: The detector of the collisions of meshes if they are validated, else None.
+        inversions: The tetrahedra that invert in each interval; empty without any tetrahedra.
     """
 
     intervals: list[Interval]
+    moments: list[tuple[_Moment, _Moment]]
     arcs: RigidMotion | None
-    mesh: CollisionMesh
+    detector: CollisionDetector
     collisions: Collisions
     stats: list[DetectionStats]
     of_strands: Collisions | None
-    intersections: list[tuple[AtTime[Intersections], AtTime[Intersections]]] | None
-    proximities: list[tuple[AtTime[Proximities], AtTime[Proximities]]] | None
-    inversions: list[Inversions] | None
-    detector: CollisionDetector | None
+    inversions: list[Inversions]
 
 
 class _Copies:
-    """The meshes of a segment, once for each of some intervals, which are detected at once: each copy is a world."""
+    """The meshes of a segment, once for each of some intervals that are detected at once: each copy is a world."""
 
     def __init__(self, segment: Segment, checks: Checks, count: int):
-        self.count = count
-        faces, world = segment.faces, None
+        self.count, faces, world = count, segment.faces, None
         if count > 1:
             faces = (faces + segment.vertex_count * np.arange(count)[:, None, None]).reshape(-1, 3)
             world = np.repeat(np.arange(count), segment.vertex_count)
@@ -191,10 +199,8 @@ class _Copies:
         found = self.finder.find(x, is_end=is_end)
         sizes = np.array([len(self.mesh.edges), len(self.mesh.faces)], dtype=np.int32) // self.count
         bounds = np.searchsorted(found.pairs[:, 0], sizes[0] * np.arange(self.count + 1)).tolist()
-        return [
-            Intersections(found.pairs[a:b] - number * sizes, found.crosses[a:b])
-            for number, (a, b) in enumerate(pairwise(bounds))
-        ]
+        rows = [slice(*both) for both in pairwise(bounds)]
+        return [Intersections(found.pairs[own] - i * sizes, found.crosses[own]) for i, own in enumerate(rows)]
 
 
 class _SegmentDetector:
@@ -212,15 +218,13 @@ class _SegmentDetector:
         self.mesh = self._alone.mesh
         self.device = self.mesh.device.alias
         self.strands = _StrandChecker(segment, checks) if segment.has_strands else None
-        self._of_meshes: Intersections | None = None  # found last, those of meshes alone
-        self._intersections: AtTime[Intersections] | None = None  # and all
+        self._last: _Moment | None = None  # the last one that was checked
         tets, self._inversions = segment.tetrahedra, None
         if len(tets.corners):
             mesh = CollisionMesh(np.empty((0, 3), int), tets.vertex_count, tets=tets.corners, device=checks.device)
             self._inversions = CollisionDetector(mesh, method=checks.method)
         clearance = checks.clearance
         self._proximity_finder = None if clearance is None else ProximityFinder(self.mesh, clearance)
-        self._proximities: AtTime[Proximities] | None = None
 
     def detect(self, intervals: list[Interval]) -> Iterator[_Detection]:
         """Yields what is detected in intervals: in all at once, or one by one if the counts of each are not known."""
@@ -228,11 +232,13 @@ class _SegmentDetector:
             self._copies = _Copies(self._segment, self._checks, len(intervals))
         copies = self._alone if len(intervals) == 1 else self._copies
         interval, detector, (x0, x1) = intervals[0], copies.detector, positions_of(intervals)
-        arcs, starts = arcs_of(interval), []
-        for number, one in enumerate(intervals):
-            before = intervals[number - 1]
-            is_joined = number > 0 and AtTime(before.end, before.x1, None).is_at(one.x0, one.start)
-            starts.append(None if is_joined or not copies.finder else self.find_intersections(one))
+        arcs, moments, last = arcs_of(interval), [], self._last
+        for one in intervals:
+            start = last if last and last.is_at(one.x0, one.start) else _Moment(one.start, one.x0)
+            last = start if start.is_at(one.x1, one.end) else _Moment(one.end, one.x1)
+            moments.append((start, last))
+        starts, ends = zip(*moments, strict=True)
+        self.find_at([start for start in starts if start not in ends])
         if interval.is_at_rest:  # at rest, coplanar faces would be many collisions between obstacles
             nothing = CollisionMesh(np.empty((0, 3), int), 0, device=self.mesh.device)
             detector = CollisionDetector(nothing, method=detector.method)
@@ -245,67 +251,29 @@ class _SegmentDetector:
                 yield from self.detect([one])
             return
         of_strands = self.strands.detect(interval, arcs) if self.strands and not interval.is_at_rest else None
-        intersections = None
-        if copies.finder:
-            ends = self._find_at_ends(intervals, x1, copies, None if interval.is_at_rest or arcs else collisions)
-            intersections = [(start or ends[number - 1], ends[number]) for number, start in enumerate(starts)]
-        proximities = None
-        if self._proximity_finder:
-            proximities = [
-                (self._find_proximities(one.x0, one.start), self._find_proximities(one.x1, one.end))
-                for one in intervals
-            ]
-        inversions = None
-        if self._inversions:
-            inversions = [self._inversions.inversions(*one.tet_positions) for one in intervals]
-        validated = detector if self._checks.validate != 0 else None
-        found = intersections, proximities, inversions
-        yield _Detection(intervals, arcs, copies.mesh, collisions, stats, of_strands, *found, validated)
+        motion = None if interval.is_at_rest or arcs else collisions
+        if copies.finder and motion is not None:
+            if len(intervals) == 1:
+                ends[0].of_meshes = copies.finder.find_at_end(x1, starts[0].of_meshes, motion)
+            else:
+                for end, found in zip(ends, copies.find_intersections(x1, is_end=True), strict=True):
+                    end.of_meshes = found
+        self.find_at(ends, is_end=motion is not None)
+        self._last = last
+        inversions = [self._inversions.inversions(*one.tet_positions) for one in intervals if self._inversions]
+        yield _Detection(intervals, moments, arcs, detector, collisions, stats, of_strands, inversions)
 
-    def find_intersections(self, interval: Interval) -> AtTime[Intersections]:
-        """Returns the intersections at the start of an interval; those found last, if they are of that time."""
-        if self._intersections is None or not self._intersections.is_at(interval.x0, interval.start):
-            (found,) = self._alone.find_intersections(interval.x0)
-            return self._keep(found, interval.x0, interval.start)
-        return self._intersections
-
-    def _find_at_ends(
-        self, intervals: list[Interval], x1: np.ndarray, copies: _Copies, motion: Collisions | None
-    ) -> list[AtTime[Intersections]]:
-        """Returns the intersections at the ends of intervals, given the collisions that have just been detected."""
-        interval, last = intervals[0], self._intersections
-        assert last and self._of_meshes and copies.finder
-        if len(intervals) == 1 and last.is_at(x1, interval.end):
-            return [last]
-        if len(intervals) == 1 and motion:
-            found = [copies.finder.find_at_end(x1, self._of_meshes, motion)]
-        else:
-            found = copies.find_intersections(x1, is_end=motion is not None)
-        return [self._keep(one, at.x1, at.end, motion) for one, at in zip(found, intervals, strict=True)]
-
-    def _keep(
-        self, found: Intersections, x: np.ndarray, time: float, motion: Collisions | None = None
-    ) -> AtTime[Intersections]:
-        """Keeps intersections of meshes as those found last, and returns them with those of curves.
-
-        Args:
-            found: The intersections.
-            x: Positions at that time, shape [vertex_count, 3].
-            time: Time code.
-            motion: The collisions of the motion to these positions, if it has just been detected; else None.
-        """
-        self._of_meshes = found
-        if self.strands:
-            found = self.strands.with_intersections(found, x, is_end=motion is not None)
-        self._intersections = AtTime(time, x, found)
-        return self._intersections
-
-    def _find_proximities(self, x: np.ndarray, time: float) -> AtTime[Proximities]:
-        """Returns the proximities at a time; those found last, if they are of that time."""
-        if self._proximities is None or not self._proximities.is_at(x, time):
-            assert self._proximity_finder
-            self._proximities = AtTime(time, x, self._proximity_finder.find(x))
-        return self._proximities
+    def find_at(self, moments: Sequence[_Moment], *, is_end: bool = False) -> None:
+        """Finds what is not known yet of some times; ``is_end``: a motion to these has just been detected."""
+        for moment in moments:
+            if moment.found is None and self._checks.intersections:
+                if moment.of_meshes is None:
+                    (moment.of_meshes,) = self._alone.find_intersections(moment.x)
+                moment.found = moment.of_meshes
+                if self.strands:
+                    moment.found = self.strands.with_intersections(moment.found, moment.x, is_end=is_end)
+            if moment.near is None and self._proximity_finder:
+                moment.near = self._proximity_finder.find(moment.x)
 
 
 class _SegmentNamer:
@@ -323,28 +291,30 @@ class _SegmentNamer:
             bodies = self._duplicates.without_twins(bodies)
             self._containment = ContainmentFinder(self._strand_mesh or self._mesh, bodies)
         self._named_duplicates = self._duplicates.named(checks.selection) if self._duplicates else ()
-        self._intersections: dict[AtTime, SceneIntersections] = {}  # those named last
-        self._proximities: dict[AtTime, SceneProximities] = {}
 
     def name(self, detection: _Detection) -> list[IntervalResult]:
         """Returns the results of intervals."""
         intervals, collisions, arcs = detection.intervals, detection.collisions, detection.arcs
-        selection, inversions = self._checks.selection, detection.inversions
-        intersections = _named(self._intersections, detection.intersections, self._name_intersections)
-        proximities = _named(self._proximities, detection.proximities, self._name_proximities)
-        contacts = find_contacts(intervals, detection.mesh, collisions, selection, arcs)
+        selection = self._checks.selection
+        self.name_at([moment for both in detection.moments for moment in both])
+        at_rest = near = [None] * len(intervals)
+        if self._checks.intersections:
+            at_rest = [(start.intersections, end.intersections) for start, end in detection.moments]
+        if self._checks.clearance is not None:
+            near = [(start.proximities, end.proximities) for start, end in detection.moments]
+        contacts = find_contacts(intervals, detection.detector.mesh, collisions, selection, arcs)
         certified, stats = collisions.certified, detection.stats
         if detection.of_strands:
             assert self._strand_mesh
             more = find_contacts(intervals, self._strand_mesh, detection.of_strands, selection, arcs)
             contacts, stats = [join_contacts(*contacts, *more)], [add_stats(*stats, detection.of_strands.stats)]
             certified &= detection.of_strands.certified
+        if self._checks.intersections:
+            contacts = compare_contacts(contacts, at_rest)
         results = []
-        if intersections:
-            contacts = compare_contacts(contacts, intersections)
         for number, (interval, found) in enumerate(zip(intervals, contacts, strict=True)):
             validation = None
-            if detection.detector:
+            if self._checks.validate != 0:
                 validation = validate(
                     detection.detector,
                     collisions,
@@ -355,55 +325,40 @@ class _SegmentNamer:
                     counted=found.counted,
                     turns=None if arcs is None else arcs.body >= 0,
                 )
-            at_rest = intersections and intersections[number], proximities and proximities[number]
             summary = summarize(
                 found,
-                *at_rest,
+                at_rest[number],
+                near[number],
                 certified=certified,
                 stats=stats[number],
                 validation=validation,
                 duplicates=self._named_duplicates,
-                inverted=summarize_inversions(inversions[number], interval) if inversions else (),
+                inverted=summarize_inversions(detection.inversions[number], interval) if detection.inversions else (),
             )
-            results.append(IntervalResult(summary, found, *at_rest, None))
+            results.append(IntervalResult(summary, found, at_rest[number], near[number], None))
         return results
 
-    def name_at_start(self, found: AtTime[Intersections]) -> SceneIntersections:
-        """Returns the named intersections of a time, with the parts inside meshes."""
-        return self._name_intersections([found])[0]
-
-    def _name_intersections(self, found: list[AtTime[Intersections]]) -> list[SceneIntersections]:
-        assert self._containment and self._duplicates
+    def name_at(self, moments: Iterable[_Moment]) -> None:
+        """Names the intersections, with the parts inside meshes, and the proximities of some times, once."""
         selection, meshes = self._checks.selection, self.segment.meshes
 
         def are_checked(pairs: np.ndarray) -> np.ndarray:
             ignored = selection.ignored_pairs(meshes, pairs) | selection.may_be_inside(meshes, pairs)
             return selection.counted_pairs(meshes, pairs) & ~ignored
 
-        is_sought = self._duplicates.may_be_checked(are_checked)
-        inside = [self._containment.find(at.x, at.found, is_sought) for at in found]
-        inside = [self._duplicates.with_twins(one, are_checked) for one in inside]
-        return name_intersections(self.segment, self._strand_mesh or self._mesh, found, inside, selection)
-
-    def _name_proximities(self, found: list[AtTime[Proximities]]) -> list[SceneProximities]:
-        selection = self._checks.selection
-        return [name_proximities(self.segment, self._mesh, at.found, at.time, selection) for at in found]
-
-
-def _named(
-    known: dict[AtTime[_Found], _Named],
-    found: list[tuple[AtTime[_Found], AtTime[_Found]]] | None,
-    name: Callable[[list[AtTime[_Found]]], list[_Named]],
-) -> list[tuple[_Named, _Named]] | None:
-    """Returns findings at both times of intervals with names; keeps those of the last time, and names what is new."""
-    if found is None:
-        return None
-    new = [at for at in dict.fromkeys(itertools.chain(*found)) if at not in known]
-    known.update(zip(new, name(new) if new else [], strict=True))
-    named = [(known[start], known[end]) for start, end in found]
-    known.clear()
-    known[found[-1][1]] = named[-1][1]
-    return named
+        new = [moment for moment in dict.fromkeys(moments) if moment.found is not None and moment.intersections is None]
+        rows = []
+        for moment in new:
+            assert self._containment and self._duplicates and moment.found
+            inside = self._containment.find(moment.x, moment.found, self._duplicates.may_be_checked(are_checked))
+            inside = self._duplicates.with_twins(inside, are_checked)
+            rows.append((moment.time, moment.x, moment.found, inside))
+        named = name_intersections(self.segment, self._strand_mesh or self._mesh, rows, selection) if new else []
+        for moment, intersections in zip(new, named, strict=True):
+            moment.intersections = intersections
+        for moment in moments:
+            if moment.near is not None and moment.proximities is None:
+                moment.proximities = name_proximities(self.segment, self._mesh, moment.near, moment.time, selection)
 
 
 class _StrandChecker:
@@ -455,9 +410,26 @@ class _StrandChecker:
         return Intersections(np.concatenate([own, more.pairs]), np.concatenate([found.crosses, more.crosses]))
 
 
-def _is_alone(interval: Interval, checks: Checks) -> bool:
-    """Returns whether an interval is detected by itself: without motion, with turns, or with more than meshes."""
-    return interval.is_at_rest or bool(interval.turns) or interval.segment.has_strands or checks.validate != 0
+def _batches(intervals: Iterable[tuple[float, Interval]], checks: Checks) -> Iterator[list[tuple[float, Interval]]]:
+    """Yields intervals, with the time to read each, in groups that are detected at once: of small meshes alone."""
+    batch: list[tuple[float, Interval]] = []
+    try:
+        for reading, interval in intervals:
+            segment = interval.segment
+            is_alone = interval.is_at_rest or interval.turns or segment.has_strands or checks.validate != 0
+            if batch and (is_alone or segment is not batch[0][1].segment):
+                yield batch
+                batch = []
+            batch.append((reading, interval))
+            if is_alone or (len(batch) + 1) * len(segment.faces) > _FACES_AT_ONCE:
+                yield batch
+                batch = []
+    except Exception:  # what has been read is checked before
+        if batch:
+            yield batch
+        raise
+    if batch:
+        yield batch
 
 
 def _timed(intervals: Iterable[Interval], deadline: float) -> Iterator[tuple[float, Interval]]:

@@ -1,5 +1,6 @@
 """The collisions of one interval in terms of the scene: prims, their own elements, points in world space."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -11,6 +12,7 @@ from .._sorted_keys import search
 from ..detection.arcs.rigid_motion import RigidMotion
 from ..detection.detector import Collisions
 from ..detection.mesh import CollisionMesh
+from ..detection.run.settings import PairKind
 from ..usd.interval import Interval, positions_of
 from ..usd.selection import Selection
 from .scene_arcs import positions_at
@@ -108,12 +110,8 @@ def find_contacts(
     vertices, faces = collisions.vertex_face.T.astype(np.int64)
     points, point_ends = collisions.vertex_edge[:, 0].astype(np.int64), mesh.edges[collisions.vertex_edge[:, 1]]
     both = collisions.vertex_vertex.astype(np.int64)
-    tois = (
-        collisions.vertex_face_toi,
-        collisions.edge_edge_toi[apart],
-        collisions.vertex_edge_toi,
-        collisions.vertex_vertex_toi,
-    )
+    tois, normal = ([getattr(collisions, f"{kind.label}_{what}") for kind in PairKind] for what in ("toi", "normal"))
+    tois[1], normal[1] = tois[1][apart], normal[1][apart]
     x0, x1 = positions_of(intervals)
 
     def at_impact(corners: np.ndarray, times: np.ndarray) -> np.ndarray:
@@ -125,12 +123,6 @@ def find_contacts(
         np.einsum("ni,nij->nj", collisions.vertex_face_coordinates, at_impact(mesh.faces[faces], tois[0])),
         (1.0 - on_edge) * edges[:, 0] + on_edge * edges[:, 1],
         at_impact(both, tois[3]).mean(axis=1),
-    ]
-    normal = [
-        collisions.vertex_face_normal,
-        collisions.edge_edge_normal[apart],
-        collisions.vertex_edge_normal,
-        collisions.vertex_vertex_normal,
     ]
     copies = np.zeros(sum(map(len, tois)), dtype=np.int64)
     if len(intervals) > 1:
@@ -169,11 +161,7 @@ def join_contacts(contacts: SceneContacts, others: SceneContacts) -> SceneContac
     """Returns the contacts of one interval followed by others of it; ``counted`` is that of the first ones."""
     names = *ScenePairs.BY_PAIR, "toi", "time", "normal"
     joined = {name: np.concatenate([getattr(contacts, name), getattr(others, name)]) for name in names}
-    ignored = {
-        meshes: contacts.ignored.get(meshes, 0) + others.ignored.get(meshes, 0)
-        for meshes in {**contacts.ignored, **others.ignored}
-    }
-    return replace(contacts, **joined, ignored=ignored)
+    return replace(contacts, **joined, ignored=dict(Counter(contacts.ignored) + Counter(others.ignored)))
 
 
 def compare_contacts(

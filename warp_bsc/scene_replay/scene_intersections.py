@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import ClassVar, Generic, NamedTuple, TypeVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -30,27 +30,7 @@ from .scene_pairs import (
     take_rows,
 )
 
-_Found = TypeVar("_Found")
 _EDGE_FACE = KINDS.index("edge-face")
-
-
-@dataclass(frozen=True, eq=False)
-class AtTime(Generic[_Found]):
-    """What is found at one time, kept for the interval that starts then.
-
-    Attributes:
-        time: The time code.
-        x: Positions of all vertices, shape [vertex_count, 3].
-        found: What is found there.
-    """
-
-    time: float
-    x: np.ndarray
-    found: _Found
-
-    def is_at(self, x: np.ndarray, time: float) -> bool:
-        """Returns whether it is of a time and of positions."""
-        return self.time == time and (self.x is x or np.array_equal(self.x, x))
 
 
 class Cuts(NamedTuple):
@@ -222,8 +202,7 @@ def pair_keys(segment: Segment, first: np.ndarray, second: np.ndarray) -> np.nda
 def name_intersections(
     segment: Segment,
     mesh: CollisionMesh,
-    found: Sequence[AtTime[Intersections]],
-    inside: Sequence[Containment],
+    moments: Sequence[tuple[float, np.ndarray, Intersections, Containment]],
     selection: Selection,
 ) -> list[SceneIntersections]:
     """Names the intersections of some times that are checked by prims and elements.
@@ -235,22 +214,21 @@ def name_intersections(
     Args:
         segment: The segment.
         mesh: The detector's mesh, made of the segment.
-        found: Its intersections at each time.
-        inside: The parts inside other meshes at each time, of the pairs that are checked.
+        moments: Each time code, the positions of the segment's vertices there, shape [vertex_count, 3], the
+            intersections of the mesh, and the parts inside other meshes, of the pairs that are checked.
         selection: The pairs of meshes that are checked.
     """
-    if not any(len(at.found.pairs) + len(within.bodies) for at, within in zip(found, inside, strict=True)):
-        return [SceneIntersections(segment, **NO_PAIRS, time=at.time, crosses=at.found.crosses, x=at.x) for at in found]
-    pairs = np.concatenate([at.found.pairs for at in found]).astype(np.int64)
-    copies = np.repeat(np.arange(len(found)), [len(at.found.pairs) for at in found])
+    if not any(len(found.pairs) + len(inside.bodies) for _, _, found, inside in moments):
+        return [SceneIntersections(segment, **NO_PAIRS, time=t, crosses=at.crosses, x=x) for t, x, at, _ in moments]
+    copies = np.repeat(np.arange(len(moments)), [len(found.pairs) for _, _, found, _ in moments])
+    pairs = np.concatenate([found.pairs for _, _, found, _ in moments]).astype(np.int64)
     ends, faces = mesh.edges[pairs[:, 0]].astype(np.int64), pairs[:, 1]
     edge_meshes, points, diagonal = segment.locate_edges(ends)
     face_meshes, polygons = segment.locate_faces(faces)
     meshes = np.stack([edge_meshes, face_meshes], axis=1)
     counted = selection.counted_pairs(segment.meshes, meshes) & ~segment.are_stiff(ends, face_meshes)
-    nowhere = np.full_like(faces, -1)
-    x = found[0].x if len(found) == 1 else np.concatenate([at.x for at in found])
-    shift = segment.vertex_count * copies[:, None]
+    nowhere, shift = np.full_like(faces, -1), segment.vertex_count * copies[:, None]
+    xs = np.concatenate([x for _, x, _, _ in moments]) if len(moments) > 1 else moments[0][1]
     arrays = {
         "kind": np.full(len(faces), _EDGE_FACE),
         "elements": np.stack([np.where(diagonal, DIAGONAL, EDGE), np.full(len(faces), FACE)], axis=1),
@@ -258,20 +236,20 @@ def name_intersections(
         "indices": np.stack([points, np.stack([polygons, nowhere], axis=1)], axis=1),
         "vertices": np.stack([ends, np.full_like(ends, -1)], axis=1),
         "faces": np.stack([nowhere, faces], axis=1),
-        "position": _meeting_points(*(x[corners + shift].astype(np.float64) for corners in (ends, mesh.faces[faces]))),
-        "crosses": np.concatenate([at.found.crosses for at in found]),
+        "position": _meeting_points(*(xs[own + shift].astype(np.float64) for own in (ends, mesh.faces[faces]))),
+        "crosses": np.concatenate([found.crosses for _, _, found, _ in moments]),
         "ignored": counted & selection.ignored_pairs(segment.meshes, meshes),
         "counted": counted,
     }
     named = []
-    for at, within, part in zip(found, inside, split_rows(arrays, copies, len(found)), strict=True):
+    for (time, x, _, inside), part in zip(moments, split_rows(arrays, copies, len(moments)), strict=True):
         ignored, counted = part.pop("ignored"), part.pop("counted")
         of_ignored = {names: n for names, (n,) in count_by_meshes(segment, part["meshes"][ignored]).items()}
         rows = take_rows(part, counted & ~ignored)
-        if len(within.bodies):
-            of_inside = _name_inside(segment, within, at.x)
+        if len(inside.bodies):
+            of_inside = _name_inside(segment, inside, x)
             rows = {name: np.concatenate([array, of_inside[name]]) for name, array in rows.items()}
-        named.append(SceneIntersections(segment, **rows, time=at.time, x=at.x, ignored=of_ignored))
+        named.append(SceneIntersections(segment, **rows, time=time, x=x, ignored=of_ignored))
     return named
 
 

@@ -107,11 +107,8 @@ class NarrowPhase:
         buffers.second_bits, buffers.last_key = self._bits[1], self._last_key
         return buffers
 
-    def counts_by_world(self, worlds: np.ndarray, world_count: int) -> list[PairCounts]:
-        """Returns the counts of the last run without arcs in each world, given the worlds of first elements.
-
-        Contacts are counted as found; those that are too wide for two limbs must be none.
-        """
+    def counts_by_world(self, worlds: np.ndarray) -> list[PairCounts]:
+        """Returns the counts of the last run, without arcs and numbers too wide, by world, given first elements'."""
         total = PairCounts(*self.counts.numpy().tolist())
         contacts, status = (values.numpy()[: total.contacts] for values in (self.contacts.pairs, self.contacts.status))
         pairs = {
@@ -121,7 +118,7 @@ class NarrowPhase:
             "unsure": contacts[status == UNSURE],
             "for_exact": contacts[self._for_exact[0].numpy()[: total.for_exact]],
         }
-        counts = [np.bincount(worlds[rows[:, 0]], minlength=world_count).tolist() for rows in pairs.values()]
+        counts = [np.bincount(worlds[rows[:, 0]], minlength=worlds.max() + 1).tolist() for rows in pairs.values()]
         return [PairCounts(**dict(zip(pairs, of_world, strict=True))) for of_world in zip(*counts, strict=True)]
 
     @property
