@@ -138,6 +138,18 @@ def test_two_workers_write_the_same_files(troubled, alone, tmp_path, capsys):
     assert len(re.findall(r"^  \S+:\d+ on cpu: \d+ intervals?, \d+\.\d+ s$", printed, re.MULTILINE)) == 2
 
 
+@pytest.mark.parametrize("options", [(), ("--ignore-initial", "--ignore", "/World/A", "*", "--clearance", "0.02")])
+def test_any_number_of_intervals_at_once(troubled, tmp_path, monkeypatch, options):
+    """Each by itself, some, or all that have one segment: the files are the same, with all counts."""
+    found = []
+    for faces in (0, 500, 10**6):
+        monkeypatch.setattr(checking, "FACES_AT_ONCE", faces)
+        found.append(run(troubled, tmp_path / str(faces), *options, status=LEFT_OUT))
+    intervals = json.loads(found[0]["hits.json"])["intervals"]
+    assert sum(bool(interval["hits"]) for interval in intervals) > 10
+    assert not say_where(found[1], found[0]) and not say_where(found[2], found[0])
+
+
 @pytest.mark.slow
 def test_workers_compare_with_a_baseline(tmp_path, waves):
     run(waves, tmp_path / "1")

@@ -80,12 +80,7 @@ class CollisionDetector:
         check_instance(mesh, "mesh", CollisionMesh, "a CollisionMesh")
         self.mesh = mesh
         self._pipeline = DetectionPipeline(
-            mesh,
-            method=method,
-            tolerance=tolerance,
-            min_distance=min_distance,
-            rings=rings,
-            only_used_vertices=True,
+            mesh, method=method, tolerance=tolerance, min_distance=min_distance, rings=rings, only_used_vertices=True
         )
         self.method: Method = method
         self.tolerance = self._pipeline.tolerance

@@ -35,7 +35,7 @@ from .scene_proximities import SceneProximities, name_proximities
 from .threads import read_ahead
 from .validation import validate
 
-_FACES_AT_ONCE = 30_000
+FACES_AT_ONCE = 30_000
 """Number of faces of all copies of a segment, of which as many as intervals are detected at once."""
 
 
@@ -112,7 +112,7 @@ class IntervalChecker:
         self, first: int, stop: int, deadline: float
     ) -> Iterator[tuple[list[Work], "_SegmentNamer", "_Detection"]]:
         """Yields the work on some intervals, the namer of their segment, and what is detected in them."""
-        for batch in read_ahead(_batches(_timed(self.scene.intervals(first, stop), deadline), self._checks)):
+        for batch in read_ahead(_batches(self.scene.intervals(first, stop), deadline, self._checks)):
             started = time.perf_counter()
             detector, namer = self._at(batch[0][1])
             for detection in detector.detect([interval for _, interval in batch]):
@@ -185,10 +185,9 @@ class _Copies:
     """The meshes of a segment, once for each of some intervals that are detected at once: each copy is a world."""
 
     def __init__(self, segment: Segment, checks: Checks, count: int):
-        self.count, faces, world = count, segment.faces, None
-        if count > 1:
-            faces = (faces + segment.vertex_count * np.arange(count)[:, None, None]).reshape(-1, 3)
-            world = np.repeat(np.arange(count), segment.vertex_count)
+        self.count, first = count, segment.vertex_count * np.arange(count)
+        faces = segment.faces if count == 1 else (segment.faces + first[:, None, None]).reshape(-1, 3)
+        world = None if count == 1 else np.repeat(np.arange(count), segment.vertex_count)
         self.mesh = CollisionMesh(faces, count * segment.vertex_count, world=world, device=checks.device)
         self.detector = CollisionDetector(self.mesh, method=checks.method)
         self.finder = self.detector.intersection_finder() if checks.intersections else None
@@ -410,33 +409,27 @@ class _StrandChecker:
         return Intersections(np.concatenate([own, more.pairs]), np.concatenate([found.crosses, more.crosses]))
 
 
-def _batches(intervals: Iterable[tuple[float, Interval]], checks: Checks) -> Iterator[list[tuple[float, Interval]]]:
-    """Yields intervals, with the time to read each, in groups that are detected at once: of small meshes alone."""
+def _batches(intervals: Iterable[Interval], deadline: float, checks: Checks) -> Iterator[list[tuple[float, Interval]]]:
+    """Yields intervals, at least one, with the time to read each [s], until a deadline: those detected at once."""
     batch: list[tuple[float, Interval]] = []
+    started = time.perf_counter()
     try:
-        for reading, interval in intervals:
-            segment = interval.segment
+        for interval in intervals:
+            segment, is_late = interval.segment, time.monotonic() > deadline
             is_alone = interval.is_at_rest or interval.turns or segment.has_strands or checks.validate != 0
             if batch and (is_alone or segment is not batch[0][1].segment):
                 yield batch
                 batch = []
-            batch.append((reading, interval))
-            if is_alone or (len(batch) + 1) * len(segment.faces) > _FACES_AT_ONCE:
+            batch.append((time.perf_counter() - started, interval))
+            if is_alone or is_late or (len(batch) + 1) * len(segment.faces) > FACES_AT_ONCE:
                 yield batch
                 batch = []
-    except Exception:  # what has been read is checked before
+            if is_late:
+                return
+            started = time.perf_counter()
+    except Exception:  # what has been read is checked before it is raised
         if batch:
             yield batch
         raise
     if batch:
         yield batch
-
-
-def _timed(intervals: Iterable[Interval], deadline: float) -> Iterator[tuple[float, Interval]]:
-    """Yields intervals, at least one, with the time to read each [s], until a deadline."""
-    started = time.perf_counter()
-    for interval in intervals:
-        yield time.perf_counter() - started, interval
-        if time.monotonic() > deadline:
-            return
-        started = time.perf_counter()

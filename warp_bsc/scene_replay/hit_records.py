@@ -117,10 +117,7 @@ def _contact_separate(contacts: SceneContacts, rows: slice) -> list[bool | None]
 
 
 _KIND = Column(
-    "kind",
-    kind_words,
-    "kind",
-    lambda values: np.array([KINDS.index(kind) for kind in values], dtype=np.int64),
+    "kind", kind_words, "kind", lambda values: np.array([KINDS.index(kind) for kind in values], dtype=np.int64)
 )
 _TIME = Column("time", lambda pairs, rows: [pairs.time] * len(pairs.kind[rows]))
 _POSITION = _numbers("position", (-1, 3))

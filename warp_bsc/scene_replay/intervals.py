@@ -115,11 +115,7 @@ def _checked_workers(workers: Any) -> int | str:
 
 
 def _replay(
-    scene: Scene,
-    checks: Checks,
-    ignore_initial: bool,
-    earlier: Iterable[IntervalResult],
-    workers: int | str,
+    scene: Scene, checks: Checks, ignore_initial: bool, earlier: Iterable[IntervalResult], workers: int | str
 ) -> Iterator[IntervalResult]:
     """Yields the results of :func:`replay`, whose arguments have been checked."""
     with contextlib.ExitStack() as stack:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -257,25 +257,14 @@ def summarize(
     contacts: SceneContacts,
     intersections: tuple[SceneIntersections, SceneIntersections] | None,
     proximities: tuple[SceneProximities, SceneProximities] | None,
-    *,
-    certified: bool,
-    stats: DetectionStats,
-    validation: Validation | None,
-    duplicates: tuple[tuple[str, ...], ...],
-    inverted: tuple[InvertedTetrahedra, ...],
+    **others: Any,
 ) -> IntervalSummary:
-    """Returns the numbers of an interval; the arguments are attributes of its result and its summary."""
+    """Returns the numbers of an interval; the arguments are attributes of its result, and others of its summary."""
     interval, earliest = contacts.interval, None
     if len(contacts):
         first = int(np.argmin(contacts.toi))
-        row = slice(first, first + 1)
-        earliest = Contact(
-            contacts.mesh_names(row)[0],
-            contacts.element_names(row)[0],
-            float(contacts.toi[first]),
-            float(contacts.time[first]),
-            tuple(contacts.position[first].tolist()),
-        )
+        meshes, elements, place = _in_words(contacts, first)
+        earliest = Contact(meshes, elements, float(contacts.toi[first]), float(contacts.time[first]), place)
     phases = None
     if contacts.phase is not None:
         phases = tuple(np.bincount(contacts.phase[contacts.phase >= 0], minlength=len(PHASES)).tolist())
@@ -290,16 +279,12 @@ def summarize(
         toi_counts=tuple(np.bincount(bins, minlength=TOI_BINS).tolist()),
         mesh_pairs={names: hits for names, (hits,) in hits_by_meshes.items()},
         earliest=earliest,
-        certified=certified,
-        stats=stats,
-        validation=validation,
         intersections=at_both(lambda found: found.summary, intersections),
         ignored=contacts.ignored,
         separate_hits=None if contacts.separate is None else int(contacts.separate.sum()),
         phases=phases,
         proximities=at_both(_summarize_proximities, proximities),
-        duplicates=duplicates,
-        inverted=inverted,
+        **others,
     )
 
 
@@ -317,22 +302,19 @@ def summarize_inversions(found: Inversions, interval: Interval) -> tuple[Inverte
     return tuple(inverted)
 
 
+def _in_words(pairs: AnyPairs, row: int) -> tuple[tuple[str, str], tuple[str, str], tuple[float, float, float]]:
+    """Returns the names of the meshes and the elements of a pair, and its position."""
+    (meshes,), (elements,) = (names(slice(row, row + 1)) for names in (pairs.mesh_names, pairs.element_names))
+    x, y, z = pairs.position[row].tolist()
+    return meshes, elements, (x, y, z)
+
+
 def _summarize_proximities(found: SceneProximities) -> ProximitySummary:
     order = np.argsort(found.distance, kind="stable")
     _, firsts, numbers = np.unique(found.mesh_keys()[order], return_index=True, return_counts=True)
     nearest = []
     for pair in np.argsort(firsts).tolist():
         row = int(order[firsts[pair]])
-        rows = slice(row, row + 1)
-        x, y, z = found.position[row].tolist()
-        nearest.append(
-            Nearest(
-                found.mesh_names(rows)[0],
-                found.element_names(rows)[0],
-                found.time,
-                float(found.distance[row]),
-                (x, y, z),
-                int(numbers[pair]),
-            )
-        )
+        meshes, elements, place = _in_words(found, row)
+        nearest.append(Nearest(meshes, elements, found.time, float(found.distance[row]), place, int(numbers[pair])))
     return ProximitySummary(found.time, len(found), tuple(nearest))

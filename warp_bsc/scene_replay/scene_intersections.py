@@ -127,14 +127,8 @@ class SceneIntersections(ScenePairs):
         """The numbers."""
         crosses = self.crosses[self.edge_rows]
         by_meshes = count_by_meshes(self.segment, self.meshes[self.edge_rows], np.stack([crosses, ~crosses], axis=1))
-        return IntersectionSummary(
-            self.time,
-            self.crossings,
-            self.touches,
-            {names: (a, b) for names, (a, b) in by_meshes.items()},
-            dict(Counter(self.mesh_names(self.inside_rows))),
-            self.ignored,
-        )
+        edges, inside = {names: (a, b) for names, (a, b) in by_meshes.items()}, self.mesh_names(self.inside_rows)
+        return IntersectionSummary(self.time, self.crossings, self.touches, edges, dict(Counter(inside)), self.ignored)
 
     @cached_property
     def of_curves(self) -> np.ndarray:

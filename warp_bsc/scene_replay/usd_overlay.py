@@ -315,12 +315,8 @@ class Overlay(ReplayOutput):
 
     def _facts(self, summary: Summary) -> dict[str, Any]:
         """Returns what programs read of the layer without its prims."""
-        facts = {
-            "command": self._command,
-            "complete": summary.is_complete,
-            "hits": summary.hits,
-            "intervals": len(summary.intervals),
-        }
+        facts = {"command": self._command, "complete": summary.is_complete, "hits": summary.hits}
+        facts["intervals"] = len(summary.intervals)
         if missing := not_listed(summary, with_end=True):
             facts["limit"] = missing.limit
             facts["collisionsNotListed"] = missing.collisions[0]

@@ -107,14 +107,8 @@ def validate(
 
     counts = collisions.stats.vertex_face, collisions.stats.edge_edge
     decided = sum(count.candidates for count in counts)
-    return Validation(
-        hits=decided_hits,
-        others=decided_others,
-        decided=decided,
-        certified=decided - sum(count.unsure for count in counts),
-        disagreements=tuple(disagreements),
-        false_hits=false_hits,
-    )
+    certified = decided - sum(count.unsure for count in counts)
+    return Validation(decided_hits, decided_others, decided, certified, tuple(disagreements), false_hits)
 
 
 def _unreported(mesh, kind, first, second, found, x0, x1) -> Iterator[np.ndarray]:

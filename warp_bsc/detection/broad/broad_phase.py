@@ -46,11 +46,4 @@ def make_broad_phase(
     checked = None
     if checked_vertices is not None and len(checked_vertices) < mesh.vertex_count:
         checked = wp.array(np.isin(np.arange(mesh.vertex_count), checked_vertices), dtype=int, device=mesh.device)
-    return BroadPhaseHierarchy(
-        mesh,
-        count,
-        capacity=capacity,
-        not_finite=not_finite,
-        checked=checked,
-        padding=padding,
-    )
+    return BroadPhaseHierarchy(mesh, count, capacity=capacity, not_finite=not_finite, checked=checked, padding=padding)

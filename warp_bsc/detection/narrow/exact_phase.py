@@ -168,14 +168,7 @@ def are_within_distance(
 
 
 def launch_exact_distances(
-    x0: wp.array,
-    x1: wp.array,
-    radius: wp.array,
-    kind: PairKind,
-    *,
-    timed: bool,
-    tolerance: float,
-    buffers: PairBuffers,
+    x0: wp.array, x1: wp.array, radius: wp.array, kind: PairKind, *, timed: bool, tolerance: float, buffers: PairBuffers
 ) -> None:
     """Decides contacts with a minimum distance exactly, and counts those delegated to the host; does not synchronize.
 
@@ -189,14 +182,7 @@ def launch_exact_distances(
 
 
 def launch_exact_phase(
-    kind: PairKind,
-    x0: wp.array,
-    x1: wp.array,
-    *,
-    timed: bool,
-    tolerance: float,
-    buffers: PairBuffers,
-    left: wp.array,
+    kind: PairKind, x0: wp.array, x1: wp.array, *, timed: bool, tolerance: float, buffers: PairBuffers, left: wp.array
 ) -> None:
     """Decides contacts exactly, without synchronizing with a GPU.
 
