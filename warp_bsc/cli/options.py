@@ -41,11 +41,7 @@ def add_command(
         epilog: The help text below the options.
     """
     command = commands.add_parser(
-        name,
-        help=summary,
-        description=description,
-        epilog=epilog,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        name, help=summary, description=description, epilog=epilog, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     command.set_defaults(run=run)
     return command
@@ -181,9 +177,7 @@ def _names(known: tuple[str, ...], text: str) -> tuple[str, ...]:
     return names
 
 
-DEVICE: Options = {
-    "--device": {"help": "Warp device, such as cpu or cuda:0 (default: the first GPU, else cpu)"},
-}
+DEVICE: Options = {"--device": {"help": "Warp device, such as cpu or cuda:0 (default: the first GPU, else cpu)"}}
 JSON: Options = {"--json": flag("print all results as JSON instead of tables")}
 THREADS: Options = {"--threads": number(positive, "number of CPU cores to use, on Linux only (default: all)")}
 

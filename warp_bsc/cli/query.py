@@ -11,17 +11,7 @@ import numpy as np
 from ..detection.queries.query import QueryResult, query_edge_edge, query_vertex_face
 from .device import find_device, loading_kernels
 from .exit_status import ExitStatus, explain_statuses
-from .options import (
-    JSON,
-    Commands,
-    add_command,
-    add_fail_on,
-    add_options,
-    detection_options,
-    distance,
-    number,
-    several,
-)
+from .options import JSON, Commands, add_command, add_fail_on, add_options, detection_options, distance, number, several
 from .query_file import KINDS, find_query_files, read_query_file
 from .query_tables import answers_of, print_queries, results_of
 from .tables import Console

@@ -265,9 +265,8 @@ def summarize(
         first = int(np.argmin(contacts.toi))
         meshes, elements, place = _in_words(contacts, first)
         earliest = Contact(meshes, elements, float(contacts.toi[first]), float(contacts.time[first]), place)
-    phases = None
-    if contacts.phase is not None:
-        phases = tuple(np.bincount(contacts.phase[contacts.phase >= 0], minlength=len(PHASES)).tolist())
+    of = contacts.phase
+    phases = None if of is None else tuple(np.bincount(of[of >= 0], minlength=len(PHASES)).tolist())
     hits_by_meshes = count_by_meshes(contacts.segment, contacts.meshes)
     bins = np.minimum(np.searchsorted(_ENDS_OF_BINS, contacts.toi, side="right"), TOI_BINS - 1)
     by_kind = np.bincount(contacts.kind, minlength=len(KINDS)).tolist()
