@@ -66,8 +66,9 @@ def test_all_files_name_one_repository(project):
     assert found == {URL}
 
 
-def test_python_versions_are_those_that_continuous_integration_tests(project):
-    workflow = ROOT / ".github" / "workflows" / "ci.yml"
+@pytest.mark.parametrize("name", ["ci", "release"])
+def test_python_versions_are_those_that_workflows_test(project, name):
+    workflow = ROOT / ".github" / "workflows" / f"{name}.yml"
     if not workflow.exists():
         pytest.skip("not a checkout")
     tested = re.search(r"python: \[(.*?)\]", workflow.read_text())[1].replace('"', "").split(", ")

@@ -5,8 +5,6 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from warp_bsc.bench.measure import given_queries as given
 from warp_bsc.bench.measure.detector import phase_columns
 from warp_bsc.bench.measure.penetration import SIMULATORS
@@ -521,32 +519,39 @@ def replay_sizes(found: Found) -> Rows:
 # The front page -----------------------------------------------------------------------------------------------------
 
 
-def front(gpu: Found, two_cores: Found, twist: Found, drape: Found) -> Rows:
-    """What the front page shows."""
+def front(twist: Found, drape: Found) -> Rows:
+    """What the front page shows of simulations: what passes through, and beside it the price."""
+    names = {
+        "vbd": "VBD",
+        "vbd-self-contact": "VBD, self-contact",
+        "ccd-vbd": "`SolverCCD(VBD)`",
+        "implicit": "`SolverImplicit`",
+    }
+    rows = [(f"a second, on an {twist['device_name'].removeprefix('NVIDIA ')}", *names.values())]
+    for found, title in ((twist, "a cloth is wrung"), (drape, "a cloth drapes over a ball")):
+        took = {run["simulator"]: run["measured"] for run in found["runs"] if run["measured"]}
+        rows.append(
+            (f"{title}: edges through faces in the worst frame", *(f"{max(took[k]['crossings'])}" for k in names))
+        )
+        seconds = {key: 1e-3 * took[key]["milliseconds"]["mean"] * took[key]["steps"] for key in names}
+        rows.append(("its steps, and their time", *(f"{took[k]['steps']}, {two(seconds[k])} s" for k in names)))
+    return rows
+
+
+def front_detector(gpu: Found, two_cores: Found) -> Rows:
+    """What the front page shows of the detector."""
     ball, on_gpu = (
         next(scene for scene in found["scenes"] if _scene_name(scene).startswith("cloth-ball"))
         for found in (two_cores, gpu)
     )
-    size = (
-        f"{ball['triangles']:,} triangles, {ball['candidates'] / 1e6:.1f} million candidates, {ball['hits']:,} contacts"
-    )
+    counts = f"{ball['candidates'] / 1e6:.1f} million candidates, {ball['hits']:,} contacts"
     name = gpu["record"]["gpus"][0].removeprefix("NVIDIA ")
-    peer = f"IPC Toolkit, the earliest time alone: {milliseconds(ipc_milliseconds(ball['ipc_toolkit']))}"
-    rows = [
-        ("measured", ""),
-        (f"{size}: all, with time and normal", f"{on_gpu['milliseconds']['cuda_graph']:.1f} ms on an {name}"),
-        ("the same on two cores", f"{milliseconds(ball['milliseconds']['detect'])} ({peer})"),
+    return [
+        (f"{ball['triangles']:,} triangles, {counts}", "time"),
+        (f"all contacts, with time and normal, on an {name}", f"{on_gpu['milliseconds']['cuda_graph']:.1f} ms"),
+        ("the same on two cores", milliseconds(ball["milliseconds"]["detect"])),
+        (
+            "the earliest time alone, by the IPC Toolkit on two cores",
+            milliseconds(ipc_milliseconds(ball["ipc_toolkit"])),
+        ),
     ]
-    names = {
-        "vbd-self-contact": "VBD with its self-contact",
-        "implicit": "`SolverImplicit`",
-        "ccd-vbd": "`SolverCCD` behind VBD",
-    }
-    for found, title in ((twist, "a cloth is wrung"), (drape, "a cloth drapes over a ball")):
-        took = {run["simulator"]: run["measured"] for run in found["runs"] if run["measured"]}
-        seconds = {key: 1e-3 * took[key]["milliseconds"]["median"] * took[key]["steps"] for key in names}
-        cells = [f"{names[key]} {np.max(took[key]['crossings']):,}, {two(seconds[key])} s" for key in names]
-        device = found["device_name"].removeprefix("NVIDIA ")
-        what = "for a second: edges through faces in the worst frame, and time for all steps"
-        rows.append((f"{title} {what}", f"{'; '.join(cells)}; on an {device}"))
-    return rows

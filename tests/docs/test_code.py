@@ -29,7 +29,7 @@ inner = newton.solvers.SolverVBD(builder.finalize())
 BEFORE = {
     "newton/contacts.md": CLOTH,
     "newton/reports.md": CLOTH,
-    "usd/replay.md": "import json\nimport numpy as np\n",
+    "usd/files.md": "import json\nimport numpy as np\n",
     "usd/programs.md": f"import warp_bsc as bsc\nfrom pxr import Usd\nstage = Usd.Stage.Open({str(SCENE)!r})\n",
 }
 """What the code of a page takes for granted."""
@@ -64,16 +64,13 @@ def test_detector(tmp_path, capsys):
 
 def test_from_ipctk(tmp_path, capsys):
     names, output = run("from_ipctk.md", tmp_path, capsys)
-    shown = [
-        line.split("#")[1].strip()
-        for line in blocks_of("from_ipctk.md")[0]
-        for line in line.split("\n")
-        if "  #" in line
-    ]
     lines = output.splitlines()
-    assert lines[0].startswith("0.249999") and lines[0].endswith(" True")
-    assert lines[1:5] == ["True False", "False True", "[[3, 4], [3, 5]]", "6 [[3, 0], [4, 0], [5, 0]]"] == shown[1:5]
-    assert lines[6:] == ["False", "[[3, 0]] 1.0", "1.0", "[1.]", "0"]
+    assert lines[:2] == ["6", "3 False True"] and lines[2].startswith("0.249999")
+    assert lines[3:5] == ["True", "False True"]
+    assert lines[5:7] == ["[[3, 4], [3, 5]]", "[[3, 0], [4, 0], [5, 0]]"]
+    assert lines[8:] == ["False", "[[3, 0]] 1.0", "1.0", "[1.]", "0"]
+    shown = set(re.findall(r"# ([^,;\n]*?)(?:[,;]|\.\.\.|$)", "\n".join(blocks_of("from_ipctk.md")[0]), re.MULTILINE))
+    assert shown >= {"6", "3 False True", "True", "False True", "False", "1.0", "[1.]", "0"}
     assert names["r"].hit.all() and names["group"].tolist() == [2] * 3 + [4] * 3
 
 
@@ -92,12 +89,31 @@ def test_kernels(tmp_path, capsys):
 
 def test_newton(tmp_path, capsys):
     names, output = run("newton.md", tmp_path, capsys)
+    totals = names["solver"].report.totals
+    assert (totals.steps, totals.uncertified_steps) == (10, 0) and names["plain"].report.totals.steps == 1
+    assert re.fullmatch(r"10 0\n10 0\nPenetrated\(passed=\d+, crossed=0, inside=\d+, steps=[01]\)\n", output)
+
+
+def test_gripper(tmp_path, capsys):
+    """The cloth hangs from the fingers, which carry its weight by friction."""
+    names, output = run("newton/gripper.md", tmp_path, capsys)
+    lowest, weight = map(float, output.split("\n")[0].split())
+    forces = names["forces"]
+    assert 0.05 < lowest < 0.065 and abs(forces[:, 2].sum() + weight) < 0.02 * weight
+    assert (0.8 * np.abs(forces[:, 0]) > np.abs(forces[:, 2])).all()
     report = names["solver"].report
-    assert (report.totals.steps, report.totals.uncertified_steps) == (10, 0) and report.totals.truncated_steps == 0
-    assert (
-        re.fullmatch(r"10 0\nPenetrated\(passed=\d+, crossed=0, inside=\d+, steps=[01]\)\n", output)
-        and names["plain"].report.totals.steps == 1
-    )
+    assert not report.penetrated and report.totals.uncertified_steps == 0
+
+
+def test_from_vbd(tmp_path, capsys):
+    names, _ = run("newton/from_vbd.md", tmp_path, capsys)
+    assert names["solver"].report.totals.steps == 1 and names["solver"].report.certified
+
+
+def test_from_libuipc(tmp_path, capsys):
+    _, output = run("from_libuipc.md", tmp_path, capsys)
+    uncertified, height = output.split()
+    assert uncertified == "0" and 0.2 < float(height) < 0.21  # on the ball
 
 
 def test_implicit(tmp_path, capsys):
@@ -189,11 +205,21 @@ def test_commands_of_mesh_files(tmp_path, capsys, monkeypatch):
         capsys.readouterr()
 
 
-def test_replay(tmp_path, capsys, monkeypatch):
+def test_index(tmp_path, capsys):
+    names, output = run("index.md", tmp_path, capsys)
+    np.testing.assert_allclose(names["c"].vertex_face_toi, [0.25, 0.5, 0.5], atol=2.0**-20)
+    assert output.startswith("[[3, 0], [4, 0], [5, 0]] [0.2") and output.endswith(" True\n")
+
+
+def test_files(tmp_path, capsys, monkeypatch):
+    """And the page of the command, which shows what it prints."""
     monkeypatch.chdir(tmp_path)
     assert main(["replay", str(SCENE), "--json", "hits.json", "--npz", "hits.npz", "--device", "cpu"]) == 0
-    capsys.readouterr()
-    names, output = run("usd/replay.md", tmp_path, capsys)
+    printed = " ".join(capsys.readouterr().out.split())
+    shown = re.search(r"```\n(Broken: .*?)\n\.\.\.\n", (DOCS / "usd" / "replay.md").read_text(), re.DOTALL)[1]
+    parts = re.split(r"\n(?=Collisions in|The first at|Intersections at|Frames )", shown)
+    assert len(parts) == 5 and all(" ".join(part.split()) in printed for part in parts)
+    names, output = run("usd/files.md", tmp_path, capsys)
     assert names["counts"].sum() == output.count("\n") == 33 and len(names["counts"]) == 14
 
 

@@ -15,11 +15,12 @@ import warp_bsc as bsc
 from warp_bsc import checker, kernels
 
 ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
 EXTRA = ("sphinx", "myst_parser", "pydata_sphinx_theme", "sphinx_copybutton")
 needs_extra = pytest.mark.skipif(
     not all(map(importlib.util.find_spec, EXTRA)), reason="needs the extra docs: pip install -e '.[docs]'"
 )
-LINK = re.compile(r"\]\(([^)\s]+)\)")
+LINK = re.compile(r"(?:\]\(|^\[[\w-]+\]: )([^)\s]+)", re.MULTILINE)  # in the text, or defined at the end
 OURS = re.compile(r"https://(?:github\.com/warp-bsc/warp-bsc/blob|raw\.githubusercontent\.com/warp-bsc/warp-bsc)/main/")
 FENCE = re.compile(r"^```.*?^```", re.DOTALL | re.MULTILINE)
 
@@ -67,6 +68,24 @@ def missing_names(site):
     return sorted(set(public) - anchors)
 
 
+def missing_for_programs(site):
+    """The pages of the site that llms.txt does not name, guides without Markdown, and replays without data."""
+    text = (site / "llms.txt").read_text()
+    names = {
+        str(path.relative_to(DOCS).with_suffix("")) for path in DOCS.rglob("*.*") if path.suffix in (".md", ".rst")
+    }
+    names = {name for name in names if not name.startswith("upstream/")}
+    listed = re.findall(r"^- \[.+\]\(https://\S+?/main/(\S+)\)", text, re.MULTILINE)
+    missing = sorted(names ^ {name.rpartition(".")[0] for name in listed})
+    missing += [name for name in listed if not (site / name).is_file()]
+    for path in site.rglob("*.md"):
+        for link in LINK.findall(FENCE.sub("", path.read_text())):
+            if not re.match(r"\w+:|#", link) and not (path.parent / link.partition("#")[0]).exists():
+                missing.append(f"{path.relative_to(site)}: {link}")
+    shots = sorted((site / "shots").glob("*.html"))
+    return missing + [path.name for path in shots if "Broken: " not in path.read_text()] + ["shots"] * (len(shots) != 3)
+
+
 @pytest.mark.slow
 @needs_extra
 def test_the_site_builds_without_a_warning_and_is_whole(tmp_path):
@@ -76,6 +95,7 @@ def test_the_site_builds_without_a_warning_and_is_whole(tmp_path):
     assert done.returncode == 0, done.stderr
     assert not wrong_links(tmp_path)
     assert not missing_names(tmp_path)
+    assert not missing_for_programs(tmp_path)
     assert (ROOT / "docs" / "upstream").is_dir() and not (tmp_path / "upstream").exists()  # drafts
 
 
@@ -119,3 +139,27 @@ def test_rows_of_tables_have_as_many_cells_as_their_heads():
                 if len(row) != len(head):
                     wrong.append(f"{page.relative_to(ROOT)}: {'|'.join(row)}")
     assert checked > 300 and not wrong, "\n".join(wrong)
+
+
+LONGEST = 132
+"""Characters of a line, so that differences between versions show sentences."""
+
+
+def lines_that_can_be_broken(text):
+    """Yields the lines of a page and their numbers, without tables, headings, pictures, links and what is generated."""
+    text = re.sub(r"<!-- table: .*?<!-- end -->", lambda made: "\n" * made[0].count("\n"), text, flags=re.DOTALL)
+    for number, line in enumerate(text.split("\n"), 1):
+        words = re.sub(r"\[[^\]]*\]\(\S+\)", "", line.strip(" -*")).strip()
+        if not re.match(r"\s*\||#|!\[|\[[\w-]+\]: ", line) and " " in words:
+            yield number, line
+
+
+def test_lines_are_short():
+    pages = [ROOT / "README.md", *DOCS.rglob("*.md")]
+    long = [
+        f"{page.relative_to(ROOT)}:{number}: {len(line)} characters"
+        for page in pages
+        for number, line in lines_that_can_be_broken(page.read_text())
+        if len(line) > LONGEST
+    ]
+    assert len(pages) > 30 and not long, "\n".join(long)

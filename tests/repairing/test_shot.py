@@ -114,6 +114,25 @@ def test_springs_relax_what_contacts_strain(tmp_path, capsys, dip):
     assert stretch["edge_ratio"][0] > 0.9 and stretch["edge_ratio"][1] < 1.1
 
 
+@pytest.mark.parametrize("rigid", [["--rigid", "*Button*"], []])
+def test_hard_parts_move_as_a_whole(tmp_path, capsys, rigid):
+    """A button whose corner dips through the plate keeps its shape in the shot, which turns it, up to rounding."""
+    stage = dipping_sheet(tmp_path)
+    ball = trimesh.creation.icosphere(1, 0.05)
+    turns = [trimesh.transformations.rotation_matrix(0.1 * time, (1, 2, 3))[:3, :3] for time in range(FRAMES)]
+    centres = [(0.9, 0.9, 0.03 if time == HIT else 0.1) for time in range(FRAMES)]
+    shape = ball.vertices * (1.0, 0.5, 1.5)
+    points = {t: [tuple(map(float, p)) for p in shape @ turns[t].T + centres[t]] for t in range(FRAMES)}
+    add_mesh(stage, "/World/Button", points, [3] * len(ball.faces), ball.faces.ravel().tolist())
+    output = repaired(stage, "--json", "--fail-on", "remaining", *rigid)
+    found = json.loads(capsys.readouterr().out)
+    assert found["remaining"] == {"collisions": 0, "intersections": 0}
+    x, given = points_of(output, HIT, "/World/Button"), np.array(points[HIT])
+    assert np.abs(x - given).max() > 0.01
+    distances = [np.linalg.norm(y[:, None] - y[None], axis=2) for y in (x.astype(float), given)]
+    assert (np.abs(distances[0] - distances[1]).max() < 1e-6) == bool(rigid)
+
+
 @pytest.mark.parametrize(("length", "is_good"), [(1e-4, True), (0.04, False)])
 def test_an_edge_of_no_length_in_the_shot_does_not_wreck_a_frame(tmp_path, length, is_good):
     """Two points of the sheet are nearly one; when the one is moved and the other is not, their edge counts only if it

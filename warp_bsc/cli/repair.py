@@ -73,10 +73,13 @@ examples:
 
 {explain_statuses(ExitStatus.FOUND, ExitStatus.LEFT_OUT, ExitStatus.EMPTY)}"""
 
-_OF_ALL = {"command_line", "scene", "output", "report", "keep", "min_distance", "json", "fail_on", "device"}
-_OF_ONE_FRAME = {"max_strain", "order", "previous", "rigid"}
+_OF_ALL = {"command_line", "scene", "output", "report", "keep", "rigid", "min_distance", "json"}
+_OF_ALL |= {"fail_on", "device"}
+_OF_ONE_FRAME = {"max_strain", "order", "previous"}
 _OF_FRAMES = {"max_move", "resume"}
 """The options for everything, for mesh files of one frame alone, and for several frames. Others are for USD alone."""
+_CHANGING = "keep", "rigid", "include_initial", "max_move", "min_distance"
+"""The options on which the result depends, beside the scene."""
 
 
 def add_to(commands: Commands, summary: str) -> None:
@@ -93,6 +96,7 @@ def add_to(commands: Commands, summary: str) -> None:
             "--include-initial": flag(
                 "repair also pairs of two meshes that cross at the first frame; by default these stay as they are"
             ),
+            "--rigid": patterns("hard parts: prims, and all below, or files whose connected pieces move as a whole"),
             "--max-move": number(
                 distance,
                 "leave stretches of the scene as they are in which a point must move more than D, in the scene's unit",
@@ -114,7 +118,6 @@ def add_to(commands: Commands, summary: str) -> None:
     add_options(files, {"--max-strain": number(positive_real, "strain to keep to (default: %(default)s)", default=0.1)})
     add_options(files, {"--order": flag("the files are sheets, from inside to outside, whose faces point outside")})
     add_options(files, {"--previous": patterns(previous) | {"metavar": "FILE"}})
-    add_options(files, {"--rigid": patterns("hard parts: files whose connected pieces each move as a whole")})
     command.set_defaults(default_of=command.get_default)
     out = command.add_argument_group("output")
     add_options(
@@ -168,7 +171,7 @@ def _run(arguments: argparse.Namespace) -> int:
     with loading_kernels(device):
         load_detector("exact", scene.dtype, device, intersections=True, strands=scene.has_strands)
     options = describe_selection(scene, arguments)
-    options |= {name: getattr(arguments, name) for name in ("keep", "include_initial", "max_move", "min_distance")}
+    options |= {name: getattr(arguments, name) for name in _CHANGING}
     facts = replay_facts(scene, method="exact", device=str(device), clearance=None, options=options)
     with contextlib.ExitStack() as stack:
         page = None

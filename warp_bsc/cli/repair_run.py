@@ -159,6 +159,7 @@ class RepairRun:
                 scene,
                 journal.findings,
                 keep=arguments.keep,
+                rigid=arguments.rigid,
                 max_move=arguments.max_move,
                 min_distance=arguments.min_distance,
                 device=self._device,

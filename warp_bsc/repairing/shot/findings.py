@@ -86,18 +86,19 @@ def kept_meshes(scene: Scene, keep: Iterable[str] = ()) -> dict[str, str]:
         TypeError: If ``keep`` is not a sequence of strings.
         ValueError: If a pattern matches no mesh.
     """
-    patterns = checked_strings(keep, "keep")
+    kept = dict.fromkeys(matching_meshes(scene, keep, "keep"), "it is to be kept")
+    reasons = {prim.name: prim.why_not_repaired for prim in map(scene.prim_of, scene.names) if prim.why_not_repaired}
+    return reasons | kept
+
+
+def matching_meshes(scene: Scene, patterns: Iterable[str], what: str) -> list[str]:
+    """Returns the names of the meshes of a scene that patterns match; errors are those of :func:`kept_meshes`."""
+    patterns = checked_strings(patterns, what)
     prims = [scene.prim_of(name) for name in scene.names]
     for pattern in patterns:
         if not any(Selection(prims=(pattern,)).includes(prim) for prim in prims):
-            raise ValueError(f"keep: no mesh matches {pattern}")
-    kept = {}
-    for prim in prims:
-        if patterns and Selection(prims=patterns).includes(prim):
-            kept[prim.name] = "it is to be kept"
-        elif prim.why_not_repaired:
-            kept[prim.name] = prim.why_not_repaired
-    return kept
+            raise ValueError(f"{what}: no mesh matches {pattern}")
+    return [prim.name for prim in prims if patterns and Selection(prims=patterns).includes(prim)]
 
 
 def closed_meshes(scene: Scene) -> set[str]:

@@ -26,6 +26,8 @@ _DETECTIONS = 16
 """Detections after which a step is delegated to the stage."""
 _PROJECTIONS = 20
 """Sweeps over the contacts after each detection."""
+_FITS = 4
+"""Times that contacts are moved apart and rigid groups are fitted, in turn."""
 _GAP = 0.005
 """Distance that contacts are moved apart, as a share of the median edge length: a larger one pushes sheets that lie on
 each other into the next ones."""
@@ -40,10 +42,12 @@ _LARGEST_STEP = 1.0
 """Largest displacement of a vertex that is spread, as a share of that length."""
 _EARLIEST = 0.06
 """Time of a contact on an arc, as a share of the step: an earlier one is resolved as one at this time."""
-_STRAINED = 0.1
-"""Share by which an edge is longer or shorter from which on springs relax a frame, and half of what they leave."""
-_RELAXATIONS, _RELAXING_SWEEPS, _MOMENTUM = 12, 40, 0.8
+_STRAINED = 0.095
+"""Strain of an edge, as a logarithm, from which on springs relax a frame, and twice what they leave."""
+_RELAXATIONS, _RELAXING_SWEEPS, _MOMENTUM = 16, 40, 0.8
 """Detections, sweeps of the springs before each, and the momentum of these."""
+_FAILURES = 5
+"""Detections with collisions after which the vertices that collide stay where they were."""
 _RINGS = 10
 """Edges around displaced vertices within which springs move others."""
 _TIMES = 9
@@ -65,7 +69,15 @@ class Follower:
         length: Median length of these at the start.
     """
 
-    def __init__(self, mesh: CollisionMesh, x: np.ndarray, is_movable: np.ndarray, *, min_distance: float = 0.0):
+    def __init__(
+        self,
+        mesh: CollisionMesh,
+        x: np.ndarray,
+        is_movable: np.ndarray,
+        *,
+        rigid: np.ndarray | None = None,
+        min_distance: float = 0.0,
+    ):
         """Makes the stages.
 
         Args:
@@ -73,6 +85,8 @@ class Follower:
             x: Positions at the start, float, shape [vertex_count, 3].
             is_movable: Whether each vertex may be displaced, bool, shape [vertex_count]. The others are obstacles and
                 move as given.
+            rigid: Group of each vertex that keeps the shape it has in the given positions, -1 for none, int, shape
+                [vertex_count]; default: none.
             min_distance: Distance that pairs keep, see :class:`warp_bsc.SolverCCD`.
         """
         self.mesh, self._is_movable, self._device = mesh, is_movable, mesh.device
@@ -80,6 +94,7 @@ class Follower:
         lengths = np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1)
         self.length = float(np.median(lengths)) if len(lengths) else 1.0
         self.edges = edges
+        self._rigid = rigid
         self._x, self._min_distance = np.asarray(x, np.float32), min_distance
         self._gaps = {CollisionDetector(mesh): _GAP * self.length}
         if min_distance:
@@ -105,7 +120,6 @@ class Follower:
         known: Contacts,
         free_start: np.ndarray | None = None,
         arcs: RigidMotion | None = None,
-        relaxes: bool = False,
     ) -> ShotFrame:
         """Returns positions near given ones that a straight motion reaches without a collision.
 
@@ -120,32 +134,28 @@ class Follower:
             free_start: Positions from which the straight motion to the given ones is known to be free, so that only
                 vertices that move otherwise are looked at; None if it is not known.
             arcs: The obstacles that turn on their way and how; None if all move straight.
-            relaxes: Whether springs that rest at the given positions relax what contacts strain.
         """
         tolerance *= self.length
-        device_start = self.mesh.device_positions(start, "start")
         best: tuple[float, ShotFrame] | None = None
         sweeps = list(_SWEEPS)
         target = _displaced(given, displacement)
-        x, changed = self._moved_apart(target, known), self._is_movable
+        x, changed = self._moved_apart(target, given, known), self._is_movable
         if free_start is not None:
             changed = (start != free_start).any(axis=1) | (x.astype(np.float32) != given).any(axis=1)
         for number in range(_DETECTIONS):
             x = x.astype(np.float32)
-            contacts, touched = self._contacts(device_start, x, changed, arcs)
-            if arcs is not None:
-                contacts = _on_arcs(contacts, arcs, start, x)
+            contacts, touched = self._contacts(start, x, changed, arcs)
             is_free = not touched.any()
             unspread = float(np.linalg.norm(x.astype(np.float64) - target, axis=1).max(initial=0.0))
             if is_free:
                 if best is None or unspread < best[0]:
-                    best = unspread, ShotFrame(given, x, displacement, True, known)
+                    best = unspread, ShotFrame(given, x, displacement, True, known, arcs)
                 if unspread < tolerance or not sweeps:
                     break
             elif not len(contacts.toi):
                 break
             known = Contacts.joined([known, contacts])
-            last, x = x, self._moved_apart(target, known)
+            last, x = x, self._moved_apart(target, given, known)
             while sweeps and (is_free or number == 0):
                 residual = x - target
                 size = np.linalg.norm(residual, axis=1, keepdims=True)
@@ -157,61 +167,73 @@ class Follower:
                 if np.linalg.norm(spread, axis=1).max() > _LEAST_SPREAD * size.max():
                     displacement = displacement + spread
                     target = _displaced(given, displacement)
-                    x = self._moved_apart(target, known)
+                    x = self._moved_apart(target, given, known)
             changed = touched | (x.astype(np.float32) != last).any(axis=1)
-        frame = ShotFrame(given, target, displacement, False, known) if best is None else best[1]
-        if relaxes:
-            frame = self._relaxed(frame, start, arcs)
+        frame = ShotFrame(given, target, displacement, False, known, arcs) if best is None else best[1]
         if frame.certified:
             return frame
         x, certified = self._playback.step(start, x.astype(np.float32))
         if certified and arcs is not None:  # the stage knows the chords alone
-            _, touched = self._contacts(device_start, x, self._is_movable, arcs)
+            _, touched = self._contacts(start, x, self._is_movable, arcs)
             certified = not touched.any()
-        frame = ShotFrame(given, x, displacement, certified, known)
-        return self._relaxed(frame, start, arcs) if relaxes and certified else frame
+        return ShotFrame(given, x, displacement, certified, known, arcs)
 
-    def _relaxed(self, frame: ShotFrame, start: np.ndarray, arcs: RigidMotion | None) -> ShotFrame:
-        """Returns a frame with less strain, or any that is free if the given one is not; that one if none is found.
+    def relax(self, before: ShotFrame, frame: ShotFrame, after: ShotFrame | None) -> tuple[ShotFrame, ShotFrame | None]:
+        """Returns a frame that springs, which rest in the shot, have relaxed, and the frame after it.
 
-        Arguments are those of :meth:`follow`.
+        The frames before and after it stay where they are, and the motions from one and to the other are certified. If
+        they were not, any positions with which they are will do.
         """
-        given, strain = frame.given, self._strain(frame.x, frame.given) if frame.certified else np.inf
-        if strain < _STRAINED:
-            return frame
-        springs, known, x = self._springs, frame.contacts, frame.x.astype(np.float64)
-        springs.rest_at(given.astype(np.float64), self.length)
-        displaced = np.asarray((frame.x != given).any(axis=1))
+        is_free = frame.certified and (after is None or after.certified)
+        largest, total = self._strain(frame)
+        if is_free and largest < _STRAINED:
+            return frame, after
+        # Both motions lead to the frame: that to the frame after it backwards, which passes the same positions.
+        motions = [(before.x, frame.arcs)]
+        if after is not None:
+            motions.append((after.x, None if after.arcs is None else after.arcs.reversed(frame.x, after.x)))
+        springs, known = self._springs, frame.contacts
+        springs.rest_at(frame.given.astype(np.float64), self.length)
+        displaced = np.asarray((frame.x != frame.given).any(axis=1))
         displaced[known.vertices] = True
-        around, device_start = springs.around(displaced, _RINGS), self.mesh.device_positions(start, "start")
+        moving, failures = (around := springs.around(displaced, _RINGS)), 0
         for _ in range(_RELAXATIONS):
-            goal = springs.relax(
-                x, _RELAXING_SWEEPS, 0.5 * _STRAINED, momentum=_MOMENTUM, contacts=known, around=around
+            x = springs.relax(
+                frame.x.astype(np.float64),
+                _RELAXING_SWEEPS,
+                0.5 * _STRAINED,
+                momentum=_MOMENTUM,
+                contacts=known,
+                around=moving,
             )
-            goal = self._moved_apart(goal, known).astype(np.float32)
-            changed = (goal != frame.x).any(axis=1) if frame.certified else self._is_movable
-            contacts, touched = self._contacts(device_start, goal, changed, arcs)
-            if touched.any():
-                if arcs is not None:
-                    contacts = _on_arcs(contacts, arcs, start, goal)
-                known = Contacts.joined([known, contacts])
+            x = self._moved_apart(x, frame.given, known, moving).astype(np.float32)
+            changed, collide = (x != frame.x).any(axis=1) if is_free else self._is_movable, np.zeros_like(moving)
+            for start, arcs in motions:
+                contacts, touched = self._contacts(start, x, changed, arcs)
+                known, collide = Contacts.joined([known, contacts]), collide | touched
+            if collide.any():
+                failures += 1
+                if is_free and failures >= _FAILURES:
+                    moving = moving & ~collide
                 continue
-            remaining = self._strain(goal, given)
-            if remaining >= strain:
+            relaxed = replace(frame, x=x, certified=True)
+            largest, remaining = self._strain(relaxed)
+            if is_free and remaining >= total:
                 break
-            unrelaxed = frame.unrelaxed if frame.unrelaxed is not None else frame.x if frame.certified else None
-            frame = replace(frame, x=goal, certified=True, contacts=known, unrelaxed=unrelaxed)
-            strain = remaining
-            if strain < _STRAINED:
+            frame, total, is_free = relaxed, remaining, True
+            if after is not None:
+                after = replace(after, certified=True)
+            if largest < _STRAINED:
                 break
-            x = goal.astype(np.float64)
-        return frame
+            moving, failures = around, 0
+        return frame, after
 
-    def _strain(self, x: np.ndarray, given: np.ndarray) -> float:
-        """Returns the largest share by which an edge is longer than in given positions, or shorter."""
-        lengths = [np.linalg.norm(y[self.edges[:, 1]] - y[self.edges[:, 0]], axis=1) for y in (x, given)]
+    def _strain(self, frame: ShotFrame) -> tuple[float, float]:
+        """Returns the largest strain of an edge, as a logarithm, and the sum of what springs would relax of all."""
+        lengths = [np.linalg.norm(x[self.edges[:, 1]] - x[self.edges[:, 0]], axis=1) for x in (frame.x, frame.given)]
         length, rest = (np.maximum(values, SHORTEST_EDGE * self.length) for values in lengths)
-        return float(np.maximum(length / rest, rest / length).max(initial=1.0)) - 1.0
+        strains = np.abs(np.log(length / rest))
+        return float(strains.max(initial=0.0)), float(np.maximum(strains - 0.5 * _STRAINED, 0.0).sum())
 
     def near(self, contacts: Contacts, x: np.ndarray) -> Contacts:
         """Returns the contacts of which the elements are still near each other at positions, with directions there.
@@ -229,31 +251,43 @@ class Follower:
         are_near = (distance > 0.0) & (distance < self._min_distance + _REACH * self.length)
         return replace(contacts, gap=np.minimum(contacts.gap, distance)).rows(are_near)
 
-    def _moved_apart(self, target, known: Contacts) -> np.ndarray:
-        """Returns a target at which contacts are moved apart, float64 unless there are none."""
-        if not len(known.toi):
-            return target
-        return projected(~self._is_movable, target.astype(np.float64), known, _PROJECTIONS, device=self._device)
+    def _moved_apart(self, x, given, known: Contacts, moving=None) -> np.ndarray:
+        """Returns positions with contacts moved apart and rigid groups as they are in given ones.
 
-    def _contacts(self, start: wp.array, target, changed, arcs) -> tuple[Contacts, np.ndarray]:
+        They are float64, or as they are if nothing moves.
+        """
+        movable = self._is_movable if moving is None else moving
+        groups = self._surface.rigid
+        vertices = groups.vertices
+        for _ in range(_FITS if len(vertices) else 1):
+            before = x
+            if len(known.toi):
+                x = projected(~movable, x.astype(np.float64), known, _PROJECTIONS, device=self._device)
+            if len(vertices):
+                x = groups.carried(x, given, (x != before).any(axis=1))
+                rounding = np.finfo(np.float32).eps * np.abs(x[vertices])
+                x = groups.placed(x, given, rounding)
+        return x
+
+    def _contacts(self, start, target, changed, arcs) -> tuple[Contacts, np.ndarray]:
         """Returns the contacts of a motion that can be moved apart, and which vertices collide or come too near.
 
         Pairs that start too near are delegated to the stage, which lets them come no nearer. Those of which no vertex
         is movable do not count, nor do those of which none is changed.
         """
-        end = self.mesh.device_positions(target, "target")
+        x0, x1 = self.mesh.device_positions(start, "start"), self.mesh.device_positions(target, "target")
         found, touched = [], np.zeros(len(target), dtype=bool)
         for detector, gap in self._gaps.items():
-            contacts = as_contacts(detector.mesh, detector.detect(start, end, vertices=changed, rigid_motion=arcs), gap)
+            contacts = as_contacts(detector.mesh, detector.detect(x0, x1, vertices=changed, rigid_motion=arcs), gap)
             contacts = contacts.rows(np.asarray(self._is_movable[contacts.vertices].any(axis=1)))
             touched[contacts.vertices] = True
             found.append(contacts.rows(contacts.toi > 0.0) if detector.min_distance else contacts)
         contacts = Contacts.joined(found)
         if arcs is None:
-            return self._directed(contacts, start, end), touched
+            return self._directed(contacts, x0, x1), touched
         turning = _turns(contacts, arcs)
-        straight = self._directed(contacts.rows(~turning), start, end)
-        return Contacts.joined([straight, contacts.rows(turning)]), touched
+        straight = self._directed(contacts.rows(~turning), x0, x1)
+        return _on_arcs(Contacts.joined([straight, contacts.rows(turning)]), arcs, start, target), touched
 
     def _directed(self, contacts: Contacts, x0: wp.array, x1: wp.array) -> Contacts:
         """Returns contacts of a motion with the closest points, and the directions between them, a moment before.
@@ -278,9 +312,13 @@ class Follower:
         return replace(contacts, weights=weights.numpy(), normals=normals.numpy())
 
     @functools.cached_property
+    def _surface(self) -> Surface:
+        return Surface(self.mesh, self._x, ~self._is_movable, rigid=self._rigid)
+
+    @functools.cached_property
     def _springs(self) -> Springs:
         # a shot that passes through itself often has folds that it cannot keep
-        return Springs(Surface(self.mesh, self._x, ~self._is_movable), self._is_movable, bending=0.0)
+        return Springs(self._surface, self._is_movable, bending=0.0)
 
     @functools.cached_property
     def _playback(self) -> "Playback":

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..._arguments import check_instance, checked_distance, checked_integer
 from ...detection.arcs.rigid_motion import RigidMotion
+from ...detection.at_rest.body_parts import connect_cells
 from ...detection.mesh import CollisionMesh
 from ...scene_replay.scene_arcs import arcs_of
 from ...usd.interval import Interval
@@ -17,7 +18,7 @@ from ...usd.write.points_layer import MovedFrame
 from ..contacts import Contacts
 from ..repair import repair
 from .blend import MARGIN, blend
-from .findings import Finding, kept_meshes
+from .findings import Finding, kept_meshes, matching_meshes
 from .follow import Follower
 from .mesh_groups import groups_of
 from .stretch import FollowedMesh, RepairedStretch, ShotFrame, StretchRecorder
@@ -29,6 +30,8 @@ _FADED = 0.002
 _SOUGHT, _ACCEPTED = 0.02, 0.05
 """Displacement of vertices alone, as a share of that length, that they keep while displacements are sought, and
 afterwards."""
+_WINDOW = 4
+"""Frames, the last of which wait for later ones, to be relaxed between better ones."""
 _MORE_DISTANCE = 1.0 + 2.0**-8
 """Distance that is kept, as a multiple of the minimum distance: the points of a layer are rounded."""
 
@@ -38,6 +41,7 @@ def repair_shot(
     findings: list[Finding],
     *,
     keep: Iterable[str] = (),
+    rigid: Iterable[str] = (),
     max_move: float | None = None,
     min_distance: float = 0.0,
     device: Any = None,
@@ -61,6 +65,8 @@ def repair_shot(
         findings: What a replay has found in each interval, in order, see :func:`~.findings.find_collisions`.
         keep: Patterns of meshes that are not moved, but are obstacles. Those that only a transform moves, shapes,
             curves, points, and instances are never moved.
+        rigid: Patterns of meshes of hard parts, such as buttons: each connected piece moves as a whole, and has the
+            shape that it has in the shot.
         max_move: Largest distance of a vertex from the shot, in the scene's unit of length, more than 0. A stretch that
             needs more stays as it is.
         min_distance: Distance that pairs keep in the stretches, in that unit: 0 or at least 2^-1021. It is certified
@@ -79,12 +85,12 @@ def repair_shot(
             stay as they are in more combinations than :func:`~.mesh_groups.groups_of` can tell apart.
     """
     check_instance(scene, "scene", Scene, "a Scene")
-    kept = kept_meshes(scene, keep)
+    kept, hard = kept_meshes(scene, keep), matching_meshes(scene, rigid, "rigid")
     if max_move is not None:
         max_move = checked_distance(max_move, "max_move", zero=False)
     distance = checked_distance(min_distance, "min_distance")
     done = checked_integer(start, "start", 0, len(scene))
-    return _repair_shot(_Shot(scene, findings, kept, distance * _MORE_DISTANCE, device), max_move, done, progress)
+    return _repair_shot(_Shot(scene, findings, kept, hard, distance * _MORE_DISTANCE, device), max_move, done, progress)
 
 
 def _repair_shot(shot, max_move, done, progress) -> Iterator[RepairedStretch]:
@@ -103,8 +109,8 @@ def _repair_shot(shot, max_move, done, progress) -> Iterator[RepairedStretch]:
 class _Shot:
     """A scene that is repaired, and the follower of the segment in progress."""
 
-    def __init__(self, scene, findings, kept, min_distance, device):
-        self._scene, self._findings, self._kept = scene, findings, kept
+    def __init__(self, scene, findings, kept, rigid, min_distance, device):
+        self._scene, self._findings, self._kept, self._hard = scene, findings, kept, rigid
         self._min_distance, self._device = min_distance, device
         self._segment: Segment | None = None
         self._passing = {pair for finding in findings for pair in (*finding.unrepaired_pairs, *finding.ignored_pairs)}
@@ -143,7 +149,7 @@ class _Shot:
         frame, number = start, 0
         self._record(recorder, first, start, 0)
         frames = self._follow(first, stop, last, start, contacts, used, blend(displacements))
-        for number, frame in enumerate(frames, 1):
+        for number, frame in enumerate(self._relaxed(start, frames), 1):
             self._record(recorder, first, frame, number)
         stop = first + number
         is_free = all(finding.is_free for finding in self._findings[max(first, stop - 2 * MARGIN) : stop])
@@ -185,7 +191,13 @@ class _Shot:
             self._is_single = x.dtype == np.float32
             self._origin = np.zeros(3) if self._is_single else x.mean(axis=0)
             mesh = CollisionMesh(segment.faces, len(x), group=group, mask=mask, device=self._device)
-            self._follower = Follower(mesh, self._single(x), is_movable, min_distance=self._min_distance)
+            self._rigid = np.full(len(x), -1)
+            hard = [segment.vertices_of(n) for n, found in enumerate(segment.meshes) if found.name in self._hard]
+            if hard:
+                vertices = np.concatenate(hard)
+                self._rigid[vertices] = connect_cells(mesh.edges, len(x))[vertices]
+            options: dict[str, Any] = {"rigid": self._rigid, "min_distance": self._min_distance}
+            self._follower = Follower(mesh, self._single(x), is_movable, **options)
             self._mesh = FollowedMesh(is_movable, self._follower.edges, self._follower.length)
         return self._scene.interval(index)
 
@@ -206,7 +218,7 @@ class _Shot:
         if not self._findings[first].crossings[0]:
             return ShotFrame.of_shot(given)
         fixed, distance = ~self._mesh.is_movable, self._min_distance
-        result = repair(self._follower.mesh, given, fixed=fixed, min_distance=distance)
+        result = repair(self._follower.mesh, given, fixed=fixed, rigid=self._rigid, min_distance=distance)
         if result.unresolved:
             pairs = sorted({" and ".join(dict.fromkeys(names)) for names in self._findings[first].crossing_meshes})
             why = "; ".join(dict.fromkeys(contour.reason for contour in result.unresolved))
@@ -235,7 +247,7 @@ class _Shot:
             if index >= stop and not frame.differs:
                 break
             interval = self._scene.interval(index)
-            given = self._single(interval.x1)
+            given, arcs = self._single(interval.x1), self._arcs(interval)
             if displacements is None:
                 displacement = _FADING * frame.displacement
                 size = np.linalg.norm(displacement, axis=1, keepdims=True)
@@ -244,40 +256,42 @@ class _Shot:
                 displacement = np.zeros_like(given)
                 if index - first + 1 < len(displacements):
                     displacement[used] = displacements[index - first + 1]
-            before = frame
             if self._findings[index].is_free and not frame.differs and not displacement.any():
-                frame, known = ShotFrame.of_shot(given), Contacts.none()
+                frame, known = ShotFrame.of_shot(given, arcs), Contacts.none()
             else:
                 if displacements is None:
                     known, tolerance = self._follower.near(known, frame.x), _SOUGHT
                 else:
                     known, tolerance = contacts.get(index, Contacts.none()), _ACCEPTED
-                options = {"tolerance": tolerance, "known": known, "relaxes": displacements is not None}
-                found = self._follow_to(interval, frame, displacement, options)
-                if not found.certified and frame.unrelaxed is not None:
-                    again = self._follow_to(interval, unrelaxed := frame.before_relaxing(), displacement, options)
-                    if again.certified:
-                        before, found = unrelaxed, again
+                is_free = self._findings[index].is_free and self._is_single
+                found = self._follower.follow(
+                    frame.x,
+                    given,
+                    displacement,
+                    tolerance=tolerance,
+                    known=known,
+                    free_start=frame.given if is_free else None,
+                    arcs=arcs,
+                )
                 if displacements is None:
                     known = contacts[index] = found.contacts
                 added = found.displacement if displacements is None else found.x - given
                 frame = replace(found, displacement=added.astype(np.float32))
-            if index > first:
-                yield before
-        if frame is not start:
             yield frame
 
-    def _follow_to(self, interval, start: ShotFrame, displacement, options) -> ShotFrame:
-        """Returns the positions at the end of an interval; ``options`` are those of :meth:`.Follower.follow`."""
-        is_free = self._findings[interval.index].is_free and self._is_single
-        return self._follower.follow(
-            start.x,
-            self._single(interval.x1),
-            displacement,
-            free_start=start.given if is_free else None,
-            arcs=self._arcs(interval),
-            **options,
-        )
+    def _relaxed(self, start: ShotFrame, frames: Iterator[ShotFrame]) -> Iterator[ShotFrame]:
+        """Yields the frames after a first one, relaxed: each several times, between those before and after it."""
+        window: list[ShotFrame] = [start]
+        for frame in (*frames, None):
+            if frame is not None:
+                window.append(frame)
+            for i in range(len(window) - 1 - (frame is not None), 0, -1):
+                after = window[i + 1] if i + 1 < len(window) else None
+                window[i : i + 2] = filter(None, self._follower.relax(window[i - 1], window[i], after))
+            if len(window) > _WINDOW:
+                window.pop(0)
+                yield window[0]
+        yield from window[1:]
 
     def _record(self, recorder, first, frame, number) -> None:
         """Adds the frame of a number, counted from that at the start of the first interval, to a stretch."""

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ...detection.arcs.rigid_motion import RigidMotion
 from ...usd.write.points_layer import MovedFrame
 from ..contacts import Contacts
 
@@ -72,7 +73,7 @@ class ShotFrame:
         certified: Whether the motion from the frame before, straight or on arcs, is free of collisions, and keeps the
             distance.
         contacts: The contacts that are kept apart there.
-        unrelaxed: Positions before springs relaxed them, to which the motion is certified too; None if they have not.
+        arcs: The obstacles that turn on the way to it, and how; None if all move straight.
     """
 
     given: np.ndarray
@@ -80,17 +81,12 @@ class ShotFrame:
     displacement: np.ndarray
     certified: bool = True
     contacts: Contacts = field(default_factory=Contacts.none)
-    unrelaxed: np.ndarray | None = None
+    arcs: RigidMotion | None = None
 
     @staticmethod
-    def of_shot(given: np.ndarray) -> "ShotFrame":
+    def of_shot(given: np.ndarray, arcs: RigidMotion | None = None) -> "ShotFrame":
         """Returns the frame that is as in the shot."""
-        return ShotFrame(given, given, np.zeros_like(given))
-
-    def before_relaxing(self) -> "ShotFrame":
-        """Returns the frame with the positions before springs relaxed it, which it must have."""
-        assert self.unrelaxed is not None
-        return ShotFrame(self.given, self.unrelaxed, self.unrelaxed - self.given)
+        return ShotFrame(given, given, np.zeros_like(given), arcs=arcs)
 
     @property
     def differs(self) -> bool:
