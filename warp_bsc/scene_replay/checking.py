@@ -36,7 +36,7 @@ from .threads import read_ahead
 from .validation import validate
 
 FACES_AT_ONCE = 30_000
-"""Number of faces of all copies of a segment, of which as many as intervals are detected at once."""
+"""Most faces of all copies of a segment, one for each interval that is detected at once; a copy counts 500 more."""
 
 
 @dataclass(frozen=True)
@@ -421,7 +421,7 @@ def _batches(intervals: Iterable[Interval], deadline: float, checks: Checks) -> 
                 yield batch
                 batch = []
             batch.append((time.perf_counter() - started, interval))
-            if is_alone or is_late or (len(batch) + 1) * len(segment.faces) > FACES_AT_ONCE:
+            if is_alone or is_late or (len(batch) + 1) * (len(segment.faces) + 500) > FACES_AT_ONCE:
                 yield batch
                 batch = []
             if is_late:
