@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -30,8 +30,8 @@ from .duplicates import Duplicates
 from .results import IntervalResult, Work, summarize, summarize_inversions
 from .scene_arcs import arcs_of
 from .scene_contacts import compare_contacts, find_contacts, join_contacts
-from .scene_intersections import SceneIntersections, name_intersections
-from .scene_proximities import SceneProximities, name_proximities
+from .scene_intersections import name_intersections
+from .scene_proximities import name_proximities
 from .threads import read_ahead
 from .validation import validate
 
@@ -136,7 +136,7 @@ class _Moment:
     Attributes:
         time: Time code.
         x: Positions of all vertices, shape [vertex_count, 3].
-        of_meshes: The intersections of meshes alone.
+        of_meshes: The intersections of meshes alone; None, as the others, while not found.
         found: The intersections.
         near: The proximities.
         intersections: The intersections, named.
@@ -148,8 +148,8 @@ class _Moment:
     of_meshes: Intersections | None = None
     found: Intersections | None = None
     near: Proximities | None = None
-    intersections: SceneIntersections | None = None
-    proximities: SceneProximities | None = None
+    intersections: Any = None
+    proximities: Any = None
 
     def is_at(self, x: np.ndarray, time: float) -> bool:
         """Returns whether it is of a time and of positions."""
@@ -295,21 +295,19 @@ class _SegmentNamer:
         """Returns the results of intervals."""
         intervals, collisions, arcs = detection.intervals, detection.collisions, detection.arcs
         selection = self._checks.selection
-        self.name_at([moment for both in detection.moments for moment in both])
-        at_rest = near = [None] * len(intervals)
-        if self._checks.intersections:
-            at_rest = [(start.intersections, end.intersections) for start, end in detection.moments]
-        if self._checks.clearance is not None:
-            near = [(start.proximities, end.proximities) for start, end in detection.moments]
+        moments, nothing = detection.moments, [None] * len(intervals)
+        self.name_at([moment for both in moments for moment in both])
+        at_rest = [(a.intersections, b.intersections) for a, b in moments] if self._checks.intersections else nothing
+        near = [(a.proximities, b.proximities) for a, b in moments] if self._checks.clearance is not None else nothing
         contacts = find_contacts(intervals, detection.detector.mesh, collisions, selection, arcs)
         certified, stats = collisions.certified, detection.stats
         if detection.of_strands:
             assert self._strand_mesh
             more = find_contacts(intervals, self._strand_mesh, detection.of_strands, selection, arcs)
-            contacts, stats = [join_contacts(*contacts, *more)], [add_stats(*stats, detection.of_strands.stats)]
+            contacts, stats = [join_contacts(contacts[0], more[0])], [add_stats(stats[0], detection.of_strands.stats)]
             certified &= detection.of_strands.certified
         if self._checks.intersections:
-            contacts = compare_contacts(contacts, at_rest)
+            contacts = compare_contacts(contacts, [both for both in at_rest if both])
         results = []
         for number, (interval, found) in enumerate(zip(intervals, contacts, strict=True)):
             validation = None
