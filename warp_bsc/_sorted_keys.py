@@ -1,8 +1,11 @@
 """Distinct integers, integers sought in sorted arrays, and ranges: if many, many times faster than in NumPy."""
 
+from collections.abc import Iterator
+
 import numpy as np
 
 _FEW = 1000
+_CHUNK = 1 << 20  # elements in memory at a time
 
 
 def distinct(values: np.ndarray) -> np.ndarray:
@@ -43,3 +46,16 @@ def expand_ranges(first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.n
     counts = last - first
     rows = np.repeat(np.arange(len(counts)), counts)
     return rows, np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts - first, counts)
+
+
+def expand_in_chunks(first: np.ndarray, last: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yields what :func:`expand_ranges` returns, about a chunk at a time, without empty ranges."""
+    (ranges,) = np.nonzero(last > first)
+    totals = np.cumsum((last - first)[ranges])
+    at = 0
+    while at < len(ranges):
+        before = totals[at - 1] if at else 0
+        stop = max(at + 1, int(np.searchsorted(totals, before + _CHUNK, side="right")))
+        rows, places = expand_ranges(first[ranges[at:stop]], last[ranges[at:stop]])
+        yield ranges[at + rows], places
+        at = stop

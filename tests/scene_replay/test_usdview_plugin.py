@@ -1,5 +1,6 @@
 """The plugin of usdview, run by stand-ins for usdview: it checks intervals, and goes from hit to hit."""
 
+import json
 import os
 import subprocess
 import sys
@@ -91,6 +92,16 @@ def test_the_interval_of_the_current_frame_is_checked(stage, menu, time, said):
     menu(api)["Check This Interval"]()
     assert api.said[-1].startswith(f"warp-bsc: {said}")
     assert api.frame == Usd.TimeCode(time)
+
+
+def test_what_is_meant_is_not_counted(stage, menu):
+    triage = Path(stage.GetRootLayer().realPath).with_suffix(".triage.json")
+    meant = {"meshes": ["/World/Later", "/World/Floor"], "reason": "it sinks", "who": "ada", "date": "2026-11-29"}
+    triage.write_text(json.dumps({"version": 1, "meant": [meant]}))
+    api = UsdviewApi(stage, 2)
+    menu(api)["Check This Interval"]()
+    assert api.said[-1].startswith("warp-bsc: from 2 to 4 1 collisions")
+    assert api.said[-1].endswith(f"; 1 more are meant by {triage}")
 
 
 def test_tetrahedra_that_invert_are_counted(tmp_path, menu):

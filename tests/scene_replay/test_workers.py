@@ -173,6 +173,18 @@ def test_chunks_are_of_equal_length(waves, monkeypatch, intervals):
     assert len(chunks) == {50: 16}.get(intervals, len(chunks))
 
 
+@pytest.mark.parametrize("options", [(), ("--ignore-initial", "--ignore", "/World/A", "*", "--clearance", "0.02")])
+def test_any_number_of_intervals_at_once(troubled, tmp_path, monkeypatch, options):
+    """Each by itself, some, or all that have one segment: the files are the same, with all counts."""
+    found = []
+    for faces in (0, 2000, 10**6):
+        monkeypatch.setattr(checking, "FACES_AT_ONCE", faces)
+        found.append(run(troubled, tmp_path / str(faces), *options, status=LEFT_OUT))
+    intervals = json.loads(found[0]["hits.json"])["intervals"]
+    assert sum(bool(interval["hits"]) for interval in intervals) > 10
+    assert not say_where(found[1], found[0]) and not say_where(found[2], found[0])
+
+
 @pytest.mark.slow
 def test_workers_compare_with_a_baseline(tmp_path, waves):
     run(waves, tmp_path / "1")

@@ -6,15 +6,7 @@ from dataclasses import dataclass
 from types import ModuleType
 
 from .._atomic_file import STDOUT
-from ..bench.measure import (
-    detector,
-    newton_examples,
-    paper_tables,
-    penetration,
-    queries,
-    repair,
-    response,
-)
+from ..bench.measure import detector, newton_examples, paper_tables, penetration, queries, repair, response
 from ..bench.scenes.repair import KINDS
 from . import bench_run
 from .exit_status import explain_statuses

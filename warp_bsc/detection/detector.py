@@ -1,5 +1,7 @@
 """The collision detector: every collision of a mesh that moves from one configuration to another."""
 
+from dataclasses import replace
+
 import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
@@ -14,10 +16,10 @@ from .inversions import Inversions, inversions_of_motion
 from .mesh import CollisionMesh
 from .pipeline import DetectionPipeline
 from .results.collision_finder import CollisionFinder
-from .results.collisions import Candidates, CapturedCollisions, Collisions, FreeStep
+from .results.collisions import Candidates, CapturedCollisions, Collisions, DetectionStats, FreeStep
 from .run.host_function import run_on_host
 from .run.launch import retry_until_fits
-from .run.settings import TOLERANCE, Method, PairKind
+from .run.settings import TOLERANCE, Counts, Method, PairKind
 
 _SAMPLED = 64
 """Vertices whose collisions bound the earliest time of impact. In 92,230 triangles these take a twelfth of all."""
@@ -133,6 +135,23 @@ class CollisionDetector:
             return self._arcs.find(arcs, x0, x1, changed)
         self._has_run = True
         return self._finder.find(x0, x1, changed=changed)
+
+    @one_at_a_time
+    def stats_by_world(self, collisions: Collisions) -> list[DetectionStats] | None:
+        """Returns the counts of the last detection in each world of a mesh of faces, and the times of all.
+
+        They are not known, None, if the exponents of a pair are too far apart for two limbs.
+
+        Args:
+            collisions: The result of that detection, without ``rigid_motion``.
+        """
+        pipeline, mesh = self._pipeline, self.mesh
+        if any(counts.too_wide_2 for counts in pipeline.counts.pairs.values()):
+            return None
+        assert mesh.world is not None
+        worlds = mesh.world, mesh.world[mesh.edges[:, 0]]
+        counts = [phase.counts_by_world(of) for phase, of in zip(pipeline.narrow_phases, worlds, strict=True)]
+        return [replace(collisions, _counts=Counts(0, 0, *both)).stats for both in zip(*counts, strict=True)]
 
     @one_at_a_time
     def collision_free_step(self, x0: ArrayLike | wp.array, x1: ArrayLike | wp.array) -> FreeStep:

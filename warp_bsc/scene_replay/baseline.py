@@ -3,6 +3,7 @@
 import json
 import os
 from collections import defaultdict
+from collections.abc import Iterable
 from typing import Any, Literal, NamedTuple, get_args
 
 import orjson
@@ -15,6 +16,12 @@ from .summary import Summary
 Event = Literal["collides", "crosses", "is inside", "is near", "are duplicates", "inverts"]
 """What meshes may do in a replay."""
 
+_SPANS: dict[Event, str] = {
+    "collides": "collision_spans",
+    "is near": "proximity_spans",
+    "are duplicates": "duplicate_spans",
+    "inverts": "inversion_spans",
+}
 _WITHOUT_EFFECT = {"intersections", "strict", "allow_missing", "validate", "limit", "ignore", "triage"}
 """The options that do not change what is compared; ``intersections`` and what is ignored are checked by themselves."""
 
@@ -67,19 +74,12 @@ class Baseline:
             earlier = {"method": found["method"], **found["options"]}
             no_more_ignored = _ignored(earlier) - _ignored(options)
             self._names = found["meshes"]
-            for span in found["collision_spans"]:
-                self._add("collides", span)
             for span in found["intersections"]:
-                if span["inside"]:
-                    self._add("is inside", span)
-                elif span["crossings"]:  # others only touch
-                    self._add("crosses", span)
-            for span in found["proximity_spans"]:
-                self._add("is near", span)
-            for span in found["duplicate_spans"]:
-                self._add("are duplicates", span)
-            for span in found["inversion_spans"]:
-                self._add("inverts", span)
+                if span["inside"] or span["crossings"]:  # others only touch
+                    self._add("is inside" if span["inside"] else "crosses", span)
+            for event, name in _SPANS.items():
+                for span in found[name]:
+                    self._add(event, span)
         except (ValueError, KeyError, TypeError, IndexError) as error:
             raise ValueError(f"{path}: not a JSON file of this version's replay") from error
         if not is_complete:
@@ -100,19 +100,19 @@ class Baseline:
     def new_in(self, summary: Summary) -> list[NewFinding]:
         """Returns what meshes do in a replay and did not do in the earlier one at that time."""
         found: list[NewFinding] = []
-        for interval in summary.intervals:
-            found += [NewFinding("collides", meshes, interval.start, interval.end) for meshes in interval.mesh_pairs]
-            found += [
-                NewFinding("are duplicates", meshes, interval.start, interval.end) for meshes in interval.duplicates
-            ]
-            found += [NewFinding("inverts", mesh.meshes, interval.start, interval.end) for mesh in interval.inverted]
-        for sample in summary.intersections:
-            crossing = [meshes for meshes, (crossings, _) in sample.mesh_pairs.items() if crossings]
-            found += [NewFinding("crosses", meshes, sample.time, sample.time) for meshes in crossing]
-            found += [NewFinding("is inside", meshes, sample.time, sample.time) for meshes in sample.inside]
-        for sample in summary.proximities:
-            near = [nearest.meshes for nearest in sample.nearest]
-            found += [NewFinding("is near", meshes, sample.time, sample.time) for meshes in near]
+
+        def add(what: Event, meshes: Iterable[tuple[str, ...]], start: float, end: float) -> None:
+            found.extend(NewFinding(what, names, start, end) for names in meshes)
+
+        for at in summary.intervals:
+            add("collides", at.mesh_pairs, at.start, at.end)
+            add("are duplicates", at.duplicates, at.start, at.end)
+            add("inverts", (mesh.meshes for mesh in at.inverted), at.start, at.end)
+        for at in summary.intersections:
+            add("crosses", (meshes for meshes, (crossings, _) in at.mesh_pairs.items() if crossings), at.time, at.time)
+            add("is inside", at.inside, at.time, at.time)
+        for at in summary.proximities:
+            add("is near", (nearest.meshes for nearest in at.nearest), at.time, at.time)
         return [finding for finding in found if self.lacks(finding)]
 
     def lacks(self, finding: NewFinding) -> bool:

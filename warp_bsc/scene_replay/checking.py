@@ -5,9 +5,10 @@ While the results of one interval are named, the next one is detected (on a CPU)
 
 import math
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Generic, Literal, TypeVar
+from itertools import pairwise
+from typing import Any, Literal
 
 import numpy as np
 
@@ -18,23 +19,24 @@ from ..detection.at_rest.proximities import Proximities, ProximityFinder
 from ..detection.detector import CollisionDetector
 from ..detection.inversions import Inversions
 from ..detection.mesh import CollisionMesh
-from ..detection.results.collisions import Collisions, add_stats
+from ..detection.results.collisions import Collisions, DetectionStats, add_stats
 from ..detection.run.settings import Method
 from ..detection.run.start import is_cpu
-from ..usd.interval import Interval
+from ..usd.interval import Interval, positions_of
 from ..usd.scene import Scene
 from ..usd.segment import Segment
 from ..usd.selection import Selection
 from .duplicates import Duplicates
-from .results import IntervalResult, Work, summarize, summarize_intersections, summarize_inversions
+from .results import IntervalResult, Work, summarize, summarize_inversions
 from .scene_arcs import arcs_of
 from .scene_contacts import compare_contacts, find_contacts, join_contacts
-from .scene_intersections import SceneIntersections, name_intersections
-from .scene_proximities import SceneProximities, name_proximities
+from .scene_intersections import name_intersections
+from .scene_proximities import name_proximities
 from .threads import read_ahead
 from .validation import validate
 
-_Found = TypeVar("_Found")
+FACES_AT_ONCE = 30_000
+"""Most faces of all copies of a segment, one for each interval that is detected at once; a copy counts 500 more."""
 
 
 @dataclass(frozen=True)
@@ -82,17 +84,22 @@ class IntervalChecker:
         detections = self._detect(first, stop, time.monotonic() + seconds)
         if is_cpu(self._checks.device):
             detections = read_ahead(detections)
-        for work, namer, detection in detections:
+        for works, namer, detection in detections:
             started = time.perf_counter()
-            result = namer.name(detection)
-            yield replace(result, work=replace(work, checking=work.checking + time.perf_counter() - started))
+            results = namer.name(detection)
+            share = (time.perf_counter() - started) / len(results)
+            for work, result in zip(works, results, strict=True):
+                yield replace(result, work=replace(work, checking=work.checking + share))
 
     def selection_without_initial(self) -> Selection:
         """Returns the selection that also ignores the pairs that cross, or are inside each other, at the first time."""
         interval = self.scene.interval(0)
         detector, namer = self._at(interval)
-        found = detector.find_intersections(interval.x0, interval.start)
-        found = summarize_intersections(namer.name_intersections(found, interval.x0, interval.start))
+        moment = _Moment(interval.start, interval.x0)
+        detector.find_at([moment])
+        namer.name_at([moment])
+        assert moment.intersections is not None
+        found = moment.intersections.summary
         crossing = {(min(names), max(names)) for names, (crossings, _) in found.mesh_pairs.items() if crossings}
         selection = self._checks.selection
         return replace(
@@ -101,13 +108,18 @@ class IntervalChecker:
             ignored_inside=selection.ignored_inside | found.inside.keys(),
         )
 
-    def _detect(self, first: int, stop: int, deadline: float) -> Iterator[tuple[Work, "_SegmentNamer", "_Detection"]]:
-        """Yields the work on some intervals, the namers of their segments, and what is detected in them."""
-        for reading, interval in read_ahead(_timed(self.scene.intervals(first, stop), deadline)):
+    def _detect(
+        self, first: int, stop: int, deadline: float
+    ) -> Iterator[tuple[list[Work], "_SegmentNamer", "_Detection"]]:
+        """Yields the work on some intervals, the namer of their segment, and what is detected in them."""
+        for batch in read_ahead(_batches(self.scene.intervals(first, stop), deadline, self._checks)):
             started = time.perf_counter()
-            detector, namer = self._at(interval)
-            detection = detector.detect(interval)
-            yield Work(self._worker, detector.device, reading, time.perf_counter() - started), namer, detection
+            detector, namer = self._at(batch[0][1])
+            for detection in detector.detect([interval for _, interval in batch]):
+                share = (time.perf_counter() - started) / len(batch)
+                works = [Work(self._worker, detector.device, reading, share) for reading, _ in batch]
+                yield works[: len(detection.intervals)], namer, detection
+                del batch[: len(detection.intervals)]
 
     def _at(self, interval: Interval) -> tuple["_SegmentDetector", "_SegmentNamer"]:
         if self._of_segment is None or interval.segment is not self._of_segment[1].segment:
@@ -117,42 +129,77 @@ class IntervalChecker:
         return self._of_segment
 
 
-@dataclass(frozen=True)
-class _Detection:
-    """The collisions, intersections and proximities that are detected in an interval.
+@dataclass(eq=False)
+class _Moment:
+    """A time, and what is found and named there, kept for the interval that starts then.
 
     Attributes:
-        interval: The interval.
-        arcs: The motion of vertices on arcs; None if all move straight.
-        collisions: Collisions of meshes.
-        of_strands: Collisions of curves and points; None without any.
-        intersections: Intersections at the start and at the end; None if they are not checked.
-        proximities: Proximities at the start and at the end; None if they are not checked.
-        inversions: The tetrahedra that invert; None without any tetrahedra.
-        detector: The detector of the collisions of meshes if they are validated, else None.
+        time: Time code.
+        x: Positions of all vertices, shape [vertex_count, 3].
+        of_meshes: The intersections of meshes alone; None, as the others, while not found.
+        found: The intersections.
+        near: The proximities.
+        intersections: The intersections, named.
+        proximities: The proximities, named.
     """
-
-    interval: Interval
-    arcs: RigidMotion | None
-    collisions: Collisions
-    of_strands: Collisions | None
-    intersections: tuple[Intersections, Intersections] | None
-    proximities: tuple[Proximities, Proximities] | None
-    inversions: Inversions | None
-    detector: CollisionDetector | None
-
-
-@dataclass(frozen=True)
-class _At(Generic[_Found]):
-    """Intersections or proximities of one time, kept for the interval that starts then."""
 
     time: float
     x: np.ndarray
-    found: _Found
+    of_meshes: Intersections | None = None
+    found: Intersections | None = None
+    near: Proximities | None = None
+    intersections: Any = None
+    proximities: Any = None
 
     def is_at(self, x: np.ndarray, time: float) -> bool:
-        """Returns whether they are of a time and of positions."""
+        """Returns whether it is of a time and of positions."""
         return self.time == time and (self.x is x or np.array_equal(self.x, x))
+
+
+@dataclass(frozen=True)
+class _Detection:
+    """What is detected in intervals of a segment.
+
+    Attributes:
+        intervals: The intervals.
+        moments: The start and the end of each, with intersections and proximities if these are checked.
+        arcs: The motion of vertices on arcs; None if all move straight.
+        detector: The detector, whose mesh has a copy of the segment's meshes for each interval.
+        collisions: Collisions of that mesh.
+        stats: Counts of each interval.
+        of_strands: Collisions of curves and points; None without any.
+        inversions: The tetrahedra that invert in each interval; empty without any tetrahedra.
+    """
+
+    intervals: list[Interval]
+    moments: list[tuple[_Moment, _Moment]]
+    arcs: RigidMotion | None
+    detector: CollisionDetector
+    collisions: Collisions
+    stats: list[DetectionStats]
+    of_strands: Collisions | None
+    inversions: list[Inversions]
+
+
+class _Copies:
+    """The meshes of a segment, once for each of some intervals that are detected at once: each copy is a world."""
+
+    def __init__(self, segment: Segment, checks: Checks, count: int):
+        self.count, first = count, segment.vertex_count * np.arange(count)
+        faces = segment.faces if count == 1 else (segment.faces + first[:, None, None]).reshape(-1, 3)
+        world = None if count == 1 else np.repeat(np.arange(count), segment.vertex_count)
+        self.mesh = CollisionMesh(faces, count * segment.vertex_count, world=world, device=checks.device)
+        self.detector = CollisionDetector(self.mesh, method=checks.method)
+        self.finder = self.detector.intersection_finder() if checks.intersections else None
+
+    def find_intersections(self, x: np.ndarray, *, is_end: bool = False) -> list[Intersections]:
+        """Returns the intersections of each copy, given the positions of all; see :meth:`.IntersectionFinder.find`."""
+        assert self.finder
+        found = self.finder.find(x, is_end=is_end)
+        sizes = np.array([len(self.mesh.edges), len(self.mesh.faces)], dtype=np.int32) // self.count
+        bounds = np.searchsorted(found.pairs[:, 0], sizes[0] * np.arange(self.count + 1)).tolist()
+        rows = [slice(*both) for both in pairwise(bounds)]
+        return [Intersections(found.pairs[own] - i * sizes, found.crosses[own]) for i, own in enumerate(rows)]
 
 
 class _SegmentDetector:
@@ -165,72 +212,67 @@ class _SegmentDetector:
     """
 
     def __init__(self, segment: Segment, checks: Checks):
-        self._is_validated = checks.validate != 0
-        self.mesh = CollisionMesh(segment.faces, segment.vertex_count, device=checks.device)
+        self._segment, self._checks = segment, checks
+        self._alone = self._copies = _Copies(segment, checks, 1)
+        self.mesh = self._alone.mesh
         self.device = self.mesh.device.alias
-        self._detector = CollisionDetector(self.mesh, method=checks.method)
         self.strands = _StrandChecker(segment, checks) if segment.has_strands else None
-        self._finder = self._detector.intersection_finder() if checks.intersections else None
-        self._intersections: _At[tuple[Intersections, Intersections]] | None = None  # of meshes, and of all
+        self._last: _Moment | None = None  # the last one that was checked
         tets, self._inversions = segment.tetrahedra, None
         if len(tets.corners):
             mesh = CollisionMesh(np.empty((0, 3), int), tets.vertex_count, tets=tets.corners, device=checks.device)
             self._inversions = CollisionDetector(mesh, method=checks.method)
         clearance = checks.clearance
         self._proximity_finder = None if clearance is None else ProximityFinder(self.mesh, clearance)
-        self._proximities: _At[Proximities] | None = None
 
-    def detect(self, interval: Interval) -> _Detection:
-        """Returns the detected collisions, intersections and proximities of an interval."""
-        detector, arcs = self._detector, arcs_of(interval)
-        start = self.find_intersections(interval.x0, interval.start) if self._finder else None
+    def detect(self, intervals: list[Interval]) -> Iterator[_Detection]:
+        """Yields what is detected in intervals: in all at once, or one by one if the counts of each are not known."""
+        if len(intervals) not in (1, self._copies.count):
+            self._copies = _Copies(self._segment, self._checks, len(intervals))
+        copies = self._alone if len(intervals) == 1 else self._copies
+        interval, detector, (x0, x1) = intervals[0], copies.detector, positions_of(intervals)
+        arcs, moments, last = arcs_of(interval), [], self._last
+        for one in intervals:
+            start = last if last and last.is_at(one.x0, one.start) else _Moment(one.start, one.x0)
+            last = start if start.is_at(one.x1, one.end) else _Moment(one.end, one.x1)
+            moments.append((start, last))
+        starts, ends = zip(*moments, strict=True)
+        self.find_at([start for start in starts if start not in ends])
         if interval.is_at_rest:  # at rest, coplanar faces would be many collisions between obstacles
             nothing = CollisionMesh(np.empty((0, 3), int), 0, device=self.mesh.device)
             detector = CollisionDetector(nothing, method=detector.method)
             collisions = detector.detect(np.zeros((0, 3)), np.zeros((0, 3)))
         else:
-            collisions = detector.detect(interval.x0, interval.x1, rigid_motion=arcs)
+            collisions = detector.detect(x0, x1, rigid_motion=arcs)
+        stats = [collisions.stats] if len(intervals) == 1 else detector.stats_by_world(collisions)
+        if stats is None:
+            for one in intervals:
+                yield from self.detect([one])
+            return
         of_strands = self.strands.detect(interval, arcs) if self.strands and not interval.is_at_rest else None
-        intersections = None
-        if start:
-            motion = None if interval.is_at_rest or arcs else collisions
-            intersections = start, self.find_intersections(interval.x1, interval.end, motion)
-        proximities = None
-        if self._proximity_finder:
-            at_start = self._find_proximities(interval.x0, interval.start)
-            proximities = at_start, self._find_proximities(interval.x1, interval.end)
-        inversions = self._inversions and self._inversions.inversions(*interval.tet_positions)
-        validated = detector if self._is_validated else None
-        return _Detection(interval, arcs, collisions, of_strands, intersections, proximities, inversions, validated)
-
-    def find_intersections(self, x: np.ndarray, time: float, collisions: Collisions | None = None) -> Intersections:
-        """Returns the intersections at a time; those found last, if they are of that time.
-
-        Args:
-            x: Positions at that time, shape [vertex_count, 3].
-            time: Time code.
-            collisions: Those of the motion to these positions from the positions of the intersections found last, if
-                it has just been detected; else None.
-        """
-        last = self._intersections
-        if last is None or not last.is_at(x, time):
-            assert self._finder
-            if last and collisions:
-                of_meshes = self._finder.find_at_end(x, last.found[0], collisions)
+        motion = None if interval.is_at_rest or arcs else collisions
+        if copies.finder and motion is not None:
+            if len(intervals) == 1:
+                ends[0].of_meshes = copies.finder.find_at_end(x1, starts[0].of_meshes, motion)
             else:
-                of_meshes = self._finder.find(x)
-            found = of_meshes
-            if self.strands:
-                found = self.strands.with_intersections(of_meshes, x, is_end=collisions is not None)
-            self._intersections = last = _At(time, x, (of_meshes, found))
-        return last.found[1]
+                for end, found in zip(ends, copies.find_intersections(x1, is_end=True), strict=True):
+                    end.of_meshes = found
+        self.find_at(ends, is_end=motion is not None)
+        self._last = last
+        inversions = [self._inversions.inversions(*one.tet_positions) for one in intervals if self._inversions]
+        yield _Detection(intervals, moments, arcs, detector, collisions, stats, of_strands, inversions)
 
-    def _find_proximities(self, x: np.ndarray, time: float) -> Proximities:
-        """Returns the proximities at a time; those found last, if they are of that time."""
-        if self._proximities is None or not self._proximities.is_at(x, time):
-            assert self._proximity_finder
-            self._proximities = _At(time, x, self._proximity_finder.find(x))
-        return self._proximities.found
+    def find_at(self, moments: Sequence[_Moment], *, is_end: bool = False) -> None:
+        """Finds what is not known yet of some times; ``is_end``: a motion to these has just been detected."""
+        for moment in moments:
+            if moment.found is None and self._checks.intersections:
+                if moment.of_meshes is None:
+                    (moment.of_meshes,) = self._alone.find_intersections(moment.x)
+                moment.found = moment.of_meshes
+                if self.strands:
+                    moment.found = self.strands.with_intersections(moment.found, moment.x, is_end=is_end)
+            if moment.near is None and self._proximity_finder:
+                moment.near = self._proximity_finder.find(moment.x)
 
 
 class _SegmentNamer:
@@ -248,78 +290,72 @@ class _SegmentNamer:
             bodies = self._duplicates.without_twins(bodies)
             self._containment = ContainmentFinder(self._strand_mesh or self._mesh, bodies)
         self._named_duplicates = self._duplicates.named(checks.selection) if self._duplicates else ()
-        self._intersections: tuple[Intersections, SceneIntersections] | None = None  # those named last
-        self._proximities: tuple[Proximities, SceneProximities] | None = None
 
-    def name(self, detection: _Detection) -> IntervalResult:
-        """Returns the result of an interval."""
-        interval, collisions, selection = detection.interval, detection.collisions, self._checks.selection
-        intersections = proximities = None
-        if detection.intersections:
-            start, end = detection.intersections
-            named = self.name_intersections(start, interval.x0, interval.start)
-            intersections = named, self.name_intersections(end, interval.x1, interval.end)
-        if detection.proximities:
-            start, end = detection.proximities
-            proximities = self._name_proximities(start, interval.start), self._name_proximities(end, interval.end)
-        contacts = find_contacts(interval, self._mesh, collisions, selection, detection.arcs)
-        certified, stats = collisions.certified, collisions.stats
+    def name(self, detection: _Detection) -> list[IntervalResult]:
+        """Returns the results of intervals."""
+        intervals, collisions, arcs = detection.intervals, detection.collisions, detection.arcs
+        selection = self._checks.selection
+        moments, nothing = detection.moments, [None] * len(intervals)
+        self.name_at([moment for both in moments for moment in both])
+        at_rest = [(a.intersections, b.intersections) for a, b in moments] if self._checks.intersections else nothing
+        near = [(a.proximities, b.proximities) for a, b in moments] if self._checks.clearance is not None else nothing
+        contacts = find_contacts(intervals, detection.detector.mesh, collisions, selection, arcs)
+        certified, stats = collisions.certified, detection.stats
         if detection.of_strands:
             assert self._strand_mesh
-            more = find_contacts(interval, self._strand_mesh, detection.of_strands, selection, detection.arcs)
-            contacts, stats = join_contacts(contacts, more), add_stats(stats, detection.of_strands.stats)
+            more = find_contacts(intervals, self._strand_mesh, detection.of_strands, selection, arcs)
+            contacts, stats = [join_contacts(contacts[0], more[0])], [add_stats(stats[0], detection.of_strands.stats)]
             certified &= detection.of_strands.certified
-        if intersections:
-            contacts = compare_contacts(contacts, *intersections)
-        validation = None
-        if detection.detector:
-            validation = validate(
-                detection.detector,
-                collisions,
-                interval.x0,
-                interval.x1,
-                most=None if self._checks.validate == "all" else self._checks.validate,
-                seed=interval.index,
-                counted=contacts.counted,
-                turns=None if detection.arcs is None else detection.arcs.body >= 0,
+        if self._checks.intersections:
+            contacts = compare_contacts(contacts, [both for both in at_rest if both])
+        results = []
+        for number, (interval, found) in enumerate(zip(intervals, contacts, strict=True)):
+            validation = None
+            if self._checks.validate != 0:
+                validation = validate(
+                    detection.detector,
+                    collisions,
+                    interval.x0,
+                    interval.x1,
+                    most=None if self._checks.validate == "all" else self._checks.validate,
+                    seed=interval.index,
+                    counted=found.counted,
+                    turns=None if arcs is None else arcs.body >= 0,
+                )
+            summary = summarize(
+                found,
+                at_rest[number],
+                near[number],
+                certified=certified,
+                stats=stats[number],
+                validation=validation,
+                duplicates=self._named_duplicates,
+                inverted=summarize_inversions(detection.inversions[number], interval) if detection.inversions else (),
             )
-        summary = summarize(
-            contacts,
-            intersections,
-            proximities,
-            certified=certified,
-            stats=stats,
-            validation=validation,
-            duplicates=self._named_duplicates,
-            inverted=summarize_inversions(detection.inversions, interval) if detection.inversions else (),
-        )
-        return IntervalResult(summary, contacts, intersections, proximities, None)
+            results.append(IntervalResult(summary, found, at_rest[number], near[number], None))
+        return results
 
-    def name_intersections(self, found: Intersections, x: np.ndarray, time: float) -> SceneIntersections:
-        """Returns the named intersections of a time, with the parts inside meshes; those named last, if the same.
+    def name_at(self, moments: Iterable[_Moment]) -> None:
+        """Names the intersections, with the parts inside meshes, and the proximities of some times, once."""
+        selection, meshes = self._checks.selection, self.segment.meshes
 
-        Arguments are those of :func:`.scene_intersections.name_intersections`.
-        """
-        if self._intersections is None or self._intersections[0] is not found:
-            assert self._containment and self._duplicates
-            selection, meshes = self._checks.selection, self.segment.meshes
+        def are_checked(pairs: np.ndarray) -> np.ndarray:
+            ignored = selection.ignored_pairs(meshes, pairs) | selection.may_be_inside(meshes, pairs)
+            return selection.counted_pairs(meshes, pairs) & ~ignored
 
-            def are_checked(pairs: np.ndarray) -> np.ndarray:
-                ignored = selection.ignored_pairs(meshes, pairs) | selection.may_be_inside(meshes, pairs)
-                return selection.counted_pairs(meshes, pairs) & ~ignored
-
-            inside = self._containment.find(x, found, self._duplicates.may_be_checked(are_checked))
+        new = [moment for moment in dict.fromkeys(moments) if moment.found is not None and moment.intersections is None]
+        rows = []
+        for moment in new:
+            assert self._containment and self._duplicates and moment.found
+            inside = self._containment.find(moment.x, moment.found, self._duplicates.may_be_checked(are_checked))
             inside = self._duplicates.with_twins(inside, are_checked)
-            mesh = self._strand_mesh or self._mesh
-            self._intersections = (found, name_intersections(self.segment, mesh, found, inside, x, time, selection))
-        return self._intersections[1]
-
-    def _name_proximities(self, found: Proximities, time: float) -> SceneProximities:
-        """Returns the named proximities of a time; those named last, if the same."""
-        if self._proximities is None or self._proximities[0] is not found:
-            named = name_proximities(self.segment, self._mesh, found, time, self._checks.selection)
-            self._proximities = found, named
-        return self._proximities[1]
+            rows.append((moment.time, moment.x, moment.found, inside))
+        named = name_intersections(self.segment, self._strand_mesh or self._mesh, rows, selection) if new else []
+        for moment, intersections in zip(new, named, strict=True):
+            moment.intersections = intersections
+        for moment in moments:
+            if moment.near is not None and moment.proximities is None:
+                moment.proximities = name_proximities(self.segment, self._mesh, moment.near, moment.time, selection)
 
 
 class _StrandChecker:
@@ -371,11 +407,27 @@ class _StrandChecker:
         return Intersections(np.concatenate([own, more.pairs]), np.concatenate([found.crosses, more.crosses]))
 
 
-def _timed(intervals: Iterable[Interval], deadline: float) -> Iterator[tuple[float, Interval]]:
-    """Yields intervals, at least one, with the time to read each [s], until a deadline."""
+def _batches(intervals: Iterable[Interval], deadline: float, checks: Checks) -> Iterator[list[tuple[float, Interval]]]:
+    """Yields intervals, at least one, with the time to read each [s], until a deadline: those detected at once."""
+    batch: list[tuple[float, Interval]] = []
     started = time.perf_counter()
-    for interval in intervals:
-        yield time.perf_counter() - started, interval
-        if time.monotonic() > deadline:
-            return
-        started = time.perf_counter()
+    try:
+        for interval in intervals:
+            segment, is_late = interval.segment, time.monotonic() > deadline
+            is_alone = interval.is_at_rest or interval.turns or segment.has_strands or checks.validate != 0
+            if batch and (is_alone or segment is not batch[0][1].segment):
+                yield batch
+                batch = []
+            batch.append((time.perf_counter() - started, interval))
+            if is_alone or is_late or (len(batch) + 1) * (len(segment.faces) + 500) > FACES_AT_ONCE:
+                yield batch
+                batch = []
+            if is_late:
+                return
+            started = time.perf_counter()
+    except Exception:  # what has been read is checked before it is raised
+        if batch:
+            yield batch
+        raise
+    if batch:
+        yield batch

@@ -26,6 +26,7 @@ from .summary import CERTIFIED_FOR, Summary
 from .summary_records import mesh_pairs_to_list, with_numbers
 
 _SAVE_SECONDS = 20.0
+_FOUND = "duplicate_spans", "inversion_spans", "proximity_spans", "nearest"
 
 
 def replay_facts(
@@ -137,10 +138,7 @@ class HitsJson(RecordFile):
             "intersections": [
                 with_numbers(span, numbers) | {"trend": span.trend} for span in summary.intersection_spans
             ],
-            "duplicate_spans": [with_numbers(span, numbers) for span in summary.duplicate_spans],
-            "inversion_spans": [with_numbers(span, numbers) for span in summary.inversion_spans],
-            "proximity_spans": [with_numbers(span, numbers) for span in summary.proximity_spans],
-            "nearest": [with_numbers(nearest, numbers) for nearest in summary.nearest],
+            **{name: [with_numbers(found, numbers) for found in getattr(summary, name)] for name in _FOUND},
             "validation": asdict(summary.validation) if summary.validation else None,
         }
         return tail_line(sums)

@@ -1,9 +1,8 @@
 """The result of a replay in one interval, in full and in numbers."""
 
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -13,7 +12,7 @@ from ..detection.run.settings import PairKind
 from ..usd.interval import Interval
 from ..usd.selection import Meant
 from .scene_contacts import SceneContacts
-from .scene_intersections import SceneIntersections
+from .scene_intersections import IntersectionSummary, SceneIntersections
 from .scene_pairs import KINDS, PHASES, count_by_meshes
 from .scene_proximities import SceneProximities
 from .validation import Validation
@@ -23,6 +22,8 @@ MOST_TETRAHEDRA = 1000
 
 TOI_BINS = 20
 """Number of equal parts of an interval in which times of impact are counted."""
+
+_ENDS_OF_BINS = np.linspace(0.0, 1.0, TOI_BINS + 1)[1:]
 
 
 AnyPairs = SceneContacts | SceneIntersections | SceneProximities
@@ -48,34 +49,6 @@ class Contact:
     toi: float
     time: float
     position: tuple[float, float, float]
-
-
-@dataclass(frozen=True)
-class IntersectionSummary:
-    """The intersections at one time of a scene, in numbers: edges that meet faces, and parts inside other meshes.
-
-    Attributes:
-        time: Time code.
-        crossings: Number of edges that pass through faces: pairs of an edge and a face.
-        touches: Number of edges that only touch faces.
-        mesh_pairs: Both numbers by the names of the two meshes, in the scene's order; twice the same name for a mesh
-            that intersects itself.
-        inside: Number of connected parts of a mesh that are wholly inside another mesh, by the name of the inner mesh
-            and that of the outer one.
-        ignored: Number of edges that meet faces and are ignored, by the names of the two meshes, in the scene's order.
-    """
-
-    time: float
-    crossings: int
-    touches: int
-    mesh_pairs: dict[tuple[str, str], tuple[int, int]]
-    inside: dict[tuple[str, str], int]
-    ignored: dict[tuple[str, str], int]
-
-    @property
-    def is_empty(self) -> bool:
-        """Whether nothing intersects."""
-        return not self.mesh_pairs and not self.inside
 
 
 @dataclass(frozen=True)
@@ -284,51 +257,33 @@ def summarize(
     contacts: SceneContacts,
     intersections: tuple[SceneIntersections, SceneIntersections] | None,
     proximities: tuple[SceneProximities, SceneProximities] | None,
-    *,
-    certified: bool,
-    stats: DetectionStats,
-    validation: Validation | None,
-    duplicates: tuple[tuple[str, ...], ...],
-    inverted: tuple[InvertedTetrahedra, ...],
+    **others: Any,
 ) -> IntervalSummary:
-    """Returns the numbers of an interval; the arguments are attributes of its result and its summary."""
+    """Returns the numbers of an interval; the arguments are attributes of its result, and others of its summary."""
     interval, earliest = contacts.interval, None
     if len(contacts):
         first = int(np.argmin(contacts.toi))
-        row = slice(first, first + 1)
-        earliest = Contact(
-            contacts.mesh_names(row)[0],
-            contacts.element_names(row)[0],
-            float(contacts.toi[first]),
-            float(contacts.time[first]),
-            tuple(contacts.position[first].tolist()),
-        )
-    phases = None
-    if contacts.phase is not None:
-        phases = tuple(np.bincount(contacts.phase[contacts.phase >= 0], minlength=len(PHASES)).tolist())
+        meshes, elements, place = _in_words(contacts, first)
+        earliest = Contact(meshes, elements, float(contacts.toi[first]), float(contacts.time[first]), place)
+    of = contacts.phase
+    phases = None if of is None else tuple(np.bincount(of[of >= 0], minlength=len(PHASES)).tolist())
     hits_by_meshes = count_by_meshes(contacts.segment, contacts.meshes)
+    bins = np.minimum(np.searchsorted(_ENDS_OF_BINS, contacts.toi, side="right"), TOI_BINS - 1)
     by_kind = np.bincount(contacts.kind, minlength=len(KINDS)).tolist()
     return IntervalSummary(
         index=interval.index,
         start=interval.start,
         end=interval.end,
-        vertex_face_hits=by_kind[0],
-        edge_edge_hits=by_kind[1],
-        vertex_edge_hits=by_kind[2],
-        vertex_vertex_hits=by_kind[3],
-        toi_counts=tuple(np.histogram(contacts.toi, bins=TOI_BINS, range=(0.0, 1.0))[0].tolist()),
+        **{f"{kind.label}_hits": by_kind[kind] for kind in PairKind},
+        toi_counts=tuple(np.bincount(bins, minlength=TOI_BINS).tolist()),
         mesh_pairs={names: hits for names, (hits,) in hits_by_meshes.items()},
         earliest=earliest,
-        certified=certified,
-        stats=stats,
-        validation=validation,
-        intersections=at_both(summarize_intersections, intersections),
+        intersections=at_both(lambda found: found.summary, intersections),
         ignored=contacts.ignored,
         separate_hits=None if contacts.separate is None else int(contacts.separate.sum()),
         phases=phases,
         proximities=at_both(_summarize_proximities, proximities),
-        duplicates=duplicates,
-        inverted=inverted,
+        **others,
     )
 
 
@@ -346,20 +301,11 @@ def summarize_inversions(found: Inversions, interval: Interval) -> tuple[Inverte
     return tuple(inverted)
 
 
-def summarize_intersections(found: SceneIntersections) -> IntersectionSummary:
-    """Returns the numbers of the intersections at one time."""
-    edges = found.edge_rows
-    crosses = found.crosses[edges]
-    by_meshes = count_by_meshes(found.segment, found.meshes[edges], np.stack([crosses, ~crosses], axis=1))
-    inside = Counter(found.mesh_names(found.inside_rows))
-    return IntersectionSummary(
-        found.time,
-        found.crossings,
-        found.touches,
-        {names: (a, b) for names, (a, b) in by_meshes.items()},
-        dict(inside),
-        found.ignored,
-    )
+def _in_words(pairs: AnyPairs, row: int) -> tuple[tuple[str, str], tuple[str, str], tuple[float, float, float]]:
+    """Returns the names of the meshes and the elements of a pair, and its position."""
+    (meshes,), (elements,) = (names(slice(row, row + 1)) for names in (pairs.mesh_names, pairs.element_names))
+    x, y, z = pairs.position[row].tolist()
+    return meshes, elements, (x, y, z)
 
 
 def _summarize_proximities(found: SceneProximities) -> ProximitySummary:
@@ -368,16 +314,6 @@ def _summarize_proximities(found: SceneProximities) -> ProximitySummary:
     nearest = []
     for pair in np.argsort(firsts).tolist():
         row = int(order[firsts[pair]])
-        rows = slice(row, row + 1)
-        x, y, z = found.position[row].tolist()
-        nearest.append(
-            Nearest(
-                found.mesh_names(rows)[0],
-                found.element_names(rows)[0],
-                found.time,
-                float(found.distance[row]),
-                (x, y, z),
-                int(numbers[pair]),
-            )
-        )
+        meshes, elements, place = _in_words(found, row)
+        nearest.append(Nearest(meshes, elements, found.time, float(found.distance[row]), place, int(numbers[pair])))
     return ProximitySummary(found.time, len(found), tuple(nearest))

@@ -49,19 +49,21 @@ def arcs_of(interval: Interval) -> RigidMotion | None:
     return RigidMotion(body, centre, vector, tolerance=max(_TOLERANCE * float(lever), 2.0**-40 * size))
 
 
-def positions_at(interval: Interval, arcs: RigidMotion | None, vertices: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """Returns positions of vertices at times of an interval, 0 at its start and 1 at its end, float64.
+def positions_at(
+    x0: np.ndarray, x1: np.ndarray, arcs: RigidMotion | None, vertices: np.ndarray, time: np.ndarray
+) -> np.ndarray:
+    """Returns positions of vertices at times of a motion, 0 at its start and 1 at its end, float64.
 
     Args:
-        interval: The interval.
-        arcs: The motion of its vertices on arcs; None if all move straight.
+        x0: Positions at the start, shape [vertex_count, 3].
+        x1: Positions at the end.
+        arcs: The motion of vertices on arcs; None if all move straight.
         vertices: Vertices, shape [n, k].
         time: Their times, shape [n].
 
     Returns:
         Positions, shape [n, k, 3].
     """
-    x0, x1 = interval.x0, interval.x1
     if arcs is not None:
         return points_on_arcs(arcs, x0, x1, vertices, time[:, None])
     time = time[:, None, None]

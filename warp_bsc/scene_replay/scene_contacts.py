@@ -1,5 +1,7 @@
 """The collisions of one interval in terms of the scene: prims, their own elements, points in world space."""
 
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ClassVar
@@ -10,11 +12,22 @@ from .._sorted_keys import search
 from ..detection.arcs.rigid_motion import RigidMotion
 from ..detection.detector import Collisions
 from ..detection.mesh import CollisionMesh
-from ..usd.interval import Interval
+from ..detection.run.settings import PairKind
+from ..usd.interval import Interval, positions_of
 from ..usd.selection import Selection
 from .scene_arcs import positions_at
-from .scene_intersections import SceneIntersections
-from .scene_pairs import EDGE, NO_PAIRS, VERTEX, ScenePairs, are_stiff_pairs, count_by_meshes, name_elements, take_rows
+from .scene_intersections import SceneIntersections, pair_keys, tangled_vertices
+from .scene_pairs import (
+    EDGE,
+    NO_PAIRS,
+    VERTEX,
+    ScenePairs,
+    are_stiff_pairs,
+    count_by_meshes,
+    name_elements,
+    split_rows,
+    take_rows,
+)
 
 
 @dataclass(frozen=True)
@@ -61,13 +74,13 @@ class SceneContacts(ScenePairs):
 
 
 def find_contacts(
-    interval: Interval,
+    intervals: Sequence[Interval],
     mesh: CollisionMesh,
     collisions: Collisions,
     selection: Selection,
     arcs: RigidMotion | None = None,
-) -> SceneContacts:
-    """Names the detected pairs that are checked by prims and elements.
+) -> list[SceneContacts]:
+    """Names the detected pairs of each interval that are checked by prims and elements.
 
     Excluded are pairs of meshes that never move, pairs that the selection excludes or ignores, pairs of a mesh with
     itself if only its transform moves it, and edges of one curve that are near along it, as thick curves always touch
@@ -77,24 +90,17 @@ def find_contacts(
     although the mesh does not.)
 
     Args:
-        interval: The interval.
-        mesh: The detector's mesh, made of the interval's segment: of its meshes, or of its curves and points as well.
-        collisions: Collisions of that mesh in the interval.
+        intervals: Intervals of one segment; one, if that has curves or points, or if vertices move on arcs.
+        mesh: The detector's mesh, made of that segment: of its meshes, or of its curves and points as well, with a copy
+            of them for each interval.
+        collisions: Collisions of that mesh, each copy of which moves as in its interval.
         selection: The pairs of meshes that are checked.
         arcs: The motion of the vertices on arcs; None if all move straight.
     """
-    segment = interval.segment
+    segment = intervals[0].segment
     if not len(collisions):
-        return SceneContacts(
-            segment,
-            **NO_PAIRS,
-            interval=interval,
-            toi=np.zeros(0),
-            time=np.zeros(0),
-            normal=np.zeros((0, 3)),
-            counted=np.zeros(0, dtype=bool),
-            ignored={},
-        )
+        nothing = {"toi": np.zeros(0), "time": np.zeros(0), "normal": np.zeros((0, 3)), "counted": np.zeros(0, bool)}
+        return [SceneContacts(segment, **NO_PAIRS, **nothing, interval=at, ignored={}) for at in intervals]
 
     ends = mesh.edges[collisions.edge_edge].astype(np.int64)  # (n, 2 edges, 2 ends)
     apart = ~np.isin(collisions.edge_edge, mesh.free_edges).all(axis=1)
@@ -104,16 +110,12 @@ def find_contacts(
     vertices, faces = collisions.vertex_face.T.astype(np.int64)
     points, point_ends = collisions.vertex_edge[:, 0].astype(np.int64), mesh.edges[collisions.vertex_edge[:, 1]]
     both = collisions.vertex_vertex.astype(np.int64)
-    named = name_elements(segment, vertices, faces, ends, (points, point_ends.astype(np.int64), both))
-    tois = (
-        collisions.vertex_face_toi,
-        collisions.edge_edge_toi[apart],
-        collisions.vertex_edge_toi,
-        collisions.vertex_vertex_toi,
-    )
+    tois, normal = ([getattr(collisions, f"{kind.label}_{what}") for kind in PairKind] for what in ("toi", "normal"))
+    tois[1], normal[1] = tois[1][apart], normal[1][apart]
+    x0, x1 = positions_of(intervals)
 
     def at_impact(corners: np.ndarray, times: np.ndarray) -> np.ndarray:
-        return positions_at(interval, arcs, corners, times)
+        return positions_at(x0, x1, arcs, corners, times)
 
     on_edge = np.concatenate([collisions.edge_edge_coordinates[apart, :1], collisions.vertex_edge_coordinates[:, :1]])
     edges = np.concatenate([at_impact(ends[:, 0], tois[1]), at_impact(point_ends, tois[2])])
@@ -122,12 +124,11 @@ def find_contacts(
         (1.0 - on_edge) * edges[:, 0] + on_edge * edges[:, 1],
         at_impact(both, tois[3]).mean(axis=1),
     ]
-    normal = [
-        collisions.vertex_face_normal,
-        collisions.edge_edge_normal[apart],
-        collisions.vertex_edge_normal,
-        collisions.vertex_vertex_normal,
-    ]
+    copies = np.zeros(sum(map(len, tois)), dtype=np.int64)
+    if len(intervals) > 1:
+        copies = np.concatenate([vertices, ends[:, 0, 0]]) // segment.vertex_count
+        vertices, ends, faces = vertices % segment.vertex_count, ends % segment.vertex_count, faces % len(segment.faces)
+    named = name_elements(segment, vertices, faces, ends, (points, point_ends.astype(np.int64), both))
     arrays = {"toi": tois, "position": position, "normal": normal}
     arrays = named | {name: np.concatenate(parts) for name, parts in arrays.items()}
     if len(mesh.free_edges) + len(mesh.points):
@@ -135,16 +136,15 @@ def find_contacts(
         stiff = (first == second) & np.array([part.moves and not part.deforms for part in segment.meshes])[first]
     else:
         stiff = are_stiff_pairs(segment, vertices, named["meshes"][: len(vertices), 1], ends)
-    return _select(interval, arrays, stiff, selection)
+    parts = split_rows(arrays | {"stiff": stiff}, copies, len(intervals))
+    return [_select(interval, part, selection) for interval, part in zip(intervals, parts, strict=True)]
 
 
-def _select(
-    interval: Interval, arrays: dict[str, np.ndarray], stiff: np.ndarray, selection: Selection
-) -> SceneContacts:
-    """Returns the contacts that are checked, given the arrays of all, and which are of one stiff mesh."""
+def _select(interval: Interval, arrays: dict[str, np.ndarray], selection: Selection) -> SceneContacts:
+    """Returns the contacts that are checked, given the arrays of all, and which are ``stiff``, of one stiff mesh."""
     segment, meshes = interval.segment, arrays["meshes"]
     moves = np.array([part.moves for part in segment.meshes])
-    counted = moves[meshes].any(axis=1) & selection.counted_pairs(segment.meshes, meshes) & ~stiff
+    counted = moves[meshes].any(axis=1) & selection.counted_pairs(segment.meshes, meshes) & ~arrays.pop("stiff")
     ignored = counted & selection.ignored_pairs(segment.meshes, meshes)
     counted &= ~ignored
     arrays = arrays | {"time": interval.start + arrays["toi"] * (interval.end - interval.start)}
@@ -161,33 +161,45 @@ def join_contacts(contacts: SceneContacts, others: SceneContacts) -> SceneContac
     """Returns the contacts of one interval followed by others of it; ``counted`` is that of the first ones."""
     names = *ScenePairs.BY_PAIR, "toi", "time", "normal"
     joined = {name: np.concatenate([getattr(contacts, name), getattr(others, name)]) for name in names}
-    ignored = {
-        meshes: contacts.ignored.get(meshes, 0) + others.ignored.get(meshes, 0)
-        for meshes in {**contacts.ignored, **others.ignored}
-    }
-    return replace(contacts, **joined, ignored=ignored)
+    return replace(contacts, **joined, ignored=dict(Counter(contacts.ignored) + Counter(others.ignored)))
 
 
-def compare_contacts(contacts: SceneContacts, start: SceneIntersections, end: SceneIntersections) -> SceneContacts:
-    """Returns contacts with ``separate`` and ``phase``, given the intersections at the interval's start and end."""
-    separate, phase = np.zeros(len(contacts), dtype=bool), np.full(len(contacts), -1)
-    segment = contacts.segment
-    (rows,) = np.nonzero(_may_cross(contacts)) if len(contacts) else (np.zeros(0, dtype=np.int64),)
+def compare_contacts(
+    contacts: Sequence[SceneContacts], at_rest: Sequence[tuple[SceneIntersections, SceneIntersections]]
+) -> list[SceneContacts]:
+    """Returns the contacts of intervals of a segment with ``separate`` and ``phase``.
+
+    Args:
+        contacts: The contacts of each interval.
+        at_rest: The intersections at its start and at its end.
+    """
+    segment, counts = contacts[0].segment, [len(one) for one in contacts]
+    separate, phase = np.zeros(sum(counts), dtype=bool), np.full(sum(counts), -1)
+    joined = {name: np.concatenate([getattr(one, name) for one in contacts]) for name in ScenePairs.BY_PAIR}
+    pairs = ScenePairs(segment, **joined)
+    (rows,) = np.nonzero(_may_cross(pairs)) if len(pairs) else (np.zeros(0, dtype=np.int64),)
     if len(rows):
-        separate[rows] = ~np.isin(contacts.mesh_keys()[rows], start.mesh_keys())
+        times = list({id(found): found for both in at_rest for found in both}.values())
+        number_of = {id(found): number for number, found in enumerate(times)}
+        starts, ends = np.repeat([[number_of[id(found)] for found in both] for both in at_rest], counts, axis=0)[rows].T
+        shift = len(segment.meshes) ** 2
+        crossing = np.concatenate([found.mesh_keys() + number * shift for number, found in enumerate(times)])
+        separate[rows] = ~np.isin(pairs.mesh_keys()[rows] + starts * shift, crossing)
         phase[rows] = 0
-        firsts, others = contacts.vertices[rows, 0], contacts.vertices[rows, 1][:, [0, 1, 1]]
-        seconds = np.where((contacts.kind[rows] == 0)[:, None], segment.faces[contacts.faces[rows, 1]], others)
+        firsts, others = pairs.vertices[rows, 0], pairs.vertices[rows, 1][:, [0, 1, 1]]
+        seconds = np.where((pairs.kind[rows] == 0)[:, None], segment.faces[pairs.faces[rows, 1]], others)
         firsts = np.where(firsts < 0, firsts[:, :1], firsts)
-        for weight, intersections in ((2, start), (1, end)):
-            if len(tangled := intersections.tangled_vertices):
-                keys = intersections.pair_keys(firsts[:, :, None], seconds[:, None, :]).reshape(-1)
-                found = np.minimum(search(tangled, keys), len(tangled) - 1)
-                phase[rows] += weight * (tangled[found] == keys).reshape(-1, 6).any(axis=1)
-    return replace(contacts, separate=separate, phase=phase)
+        keys, tangled = pair_keys(segment, firsts[:, :, None], seconds[:, None, :]), tangled_vertices(times)
+        if len(tangled):
+            for weight, numbers in ((2, starts), (1, ends)):
+                of_time = (keys + numbers[:, None, None] * segment.vertex_count**2).reshape(-1)
+                found = np.minimum(search(tangled, of_time), len(tangled) - 1)
+                phase[rows] += weight * (tangled[found] == of_time).reshape(-1, 6).any(axis=1)
+    parts = map(slice, np.cumsum([0, *counts]), np.cumsum(counts))
+    return [replace(one, separate=separate[own], phase=phase[own]) for one, own in zip(contacts, parts, strict=False)]
 
 
-def _may_cross(contacts: SceneContacts) -> np.ndarray:
+def _may_cross(contacts: ScenePairs) -> np.ndarray:
     """Returns whether each pair is of a surface and a surface or curve, which can cross at rest, bool, shape [n]."""
     segment = contacts.segment
     if not segment.has_strands:

@@ -1,5 +1,7 @@
 """The intersections at one time of a scene: edges that meet faces, cut curves, and parts inside other meshes."""
 
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import ClassVar, NamedTuple
@@ -24,6 +26,7 @@ from .scene_pairs import (
     VERTEX,
     ScenePairs,
     count_by_meshes,
+    split_rows,
     take_rows,
 )
 
@@ -42,6 +45,34 @@ class Cuts(NamedTuple):
     points: np.ndarray
     meshes: np.ndarray
     faces: np.ndarray
+
+
+@dataclass(frozen=True)
+class IntersectionSummary:
+    """The intersections at one time of a scene, in numbers: edges that meet faces, and parts inside other meshes.
+
+    Attributes:
+        time: Time code.
+        crossings: Number of edges that pass through faces: pairs of an edge and a face.
+        touches: Number of edges that only touch faces.
+        mesh_pairs: Both numbers by the names of the two meshes, in the scene's order; twice the same name for a mesh
+            that intersects itself.
+        inside: Number of connected parts of a mesh that are wholly inside another mesh, by the name of the inner mesh
+            and that of the outer one.
+        ignored: Number of edges that meet faces and are ignored, by the names of the two meshes, in the scene's order.
+    """
+
+    time: float
+    crossings: int
+    touches: int
+    mesh_pairs: dict[tuple[str, str], tuple[int, int]]
+    inside: dict[tuple[str, str], int]
+    ignored: dict[tuple[str, str], int]
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether nothing intersects."""
+        return not self.mesh_pairs and not self.inside
 
 
 @dataclass(frozen=True)
@@ -92,6 +123,14 @@ class SceneIntersections(ScenePairs):
         return slice(self.edge_rows.stop, len(self))
 
     @cached_property
+    def summary(self) -> IntersectionSummary:
+        """The numbers."""
+        crosses = self.crosses[self.edge_rows]
+        by_meshes = count_by_meshes(self.segment, self.meshes[self.edge_rows], np.stack([crosses, ~crosses], axis=1))
+        edges, inside = {names: (a, b) for names, (a, b) in by_meshes.items()}, self.mesh_names(self.inside_rows)
+        return IntersectionSummary(self.time, self.crossings, self.touches, edges, dict(Counter(inside)), self.ignored)
+
+    @cached_property
     def of_curves(self) -> np.ndarray:
         """Rows of the edges of curves that pass through faces, ascending, shape [m]."""
         (rows,) = np.nonzero(self.crosses)
@@ -126,34 +165,41 @@ class SceneIntersections(ScenePairs):
         faces = np.stack(np.divmod(crossed, len(segment.faces)), axis=1)[lasting]
         return Cuts(ends[lasting], segment.locate_faces(faces)[0], faces)
 
-    @cached_property
-    def tangled_vertices(self) -> np.ndarray:
-        """The pairs of a vertex of an element and a vertex of a face that cross, where elements are faces and edges.
 
-        They are given by their numbers in :meth:`pair_keys`, ascending. The edges are those of curves.
-        """
-        rows, sides = self.segment.faces_of_edges(self.vertices[self.crosses, 0])
-        others = np.concatenate([self.faces[self.crosses, 1][rows], self.faces[self.of_curves, 1]])
-        of_curves = self.vertices[self.of_curves, 0][:, [0, 1, 1]]
-        first, second = np.concatenate([self.segment.faces[sides], of_curves]), self.segment.faces[others]
-        return distinct(self.pair_keys(first[:, :, None], second[:, None, :]))
+def tangled_vertices(times: Sequence[SceneIntersections]) -> np.ndarray:
+    """Returns the pairs of a vertex of an element and a vertex of a face that cross at some times of a segment.
 
-    def pair_keys(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        """Returns a number for each pair of vertices, given in two arrays, the same for both orders."""
-        first, second = first.astype(np.int64), second.astype(np.int64)
-        return np.minimum(first, second) * self.segment.vertex_count + np.maximum(first, second)
+    They are given by their :func:`pair_keys`, plus the squared number of vertices for each time before, ascending.
+    Elements are faces, and edges of curves.
+    """
+    segment = times[0].segment
+    number = np.repeat(np.arange(len(times)), [at.crossings for at in times])
+    ends = np.concatenate([at.vertices[at.crosses, 0] for at in times])
+    faces = np.concatenate([at.faces[at.crosses, 1] for at in times])
+    rows, sides = segment.faces_of_edges(ends)
+    keys = [(number[rows], segment.faces[sides], segment.faces[faces[rows]])]
+    for i, at in enumerate(times):
+        if len(at.of_curves):
+            of_curves = at.vertices[at.of_curves, 0][:, [0, 1, 1]]
+            keys.append((np.full(len(of_curves), i), of_curves, segment.faces[at.faces[at.of_curves, 1]]))
+    number, first, second = (np.concatenate(arrays) for arrays in zip(*keys, strict=True))
+    offsets = number[:, None, None] * segment.vertex_count**2
+    return distinct(pair_keys(segment, first[:, :, None], second[:, None, :]) + offsets)
+
+
+def pair_keys(segment: Segment, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Returns a number for each pair of vertices, given in two arrays, the same for both orders."""
+    first, second = first.astype(np.int64), second.astype(np.int64)
+    return np.minimum(first, second) * segment.vertex_count + np.maximum(first, second)
 
 
 def name_intersections(
     segment: Segment,
     mesh: CollisionMesh,
-    found: Intersections,
-    inside: Containment,
-    x: np.ndarray,
-    time: float,
+    moments: Sequence[tuple[float, np.ndarray, Intersections, Containment]],
     selection: Selection,
-) -> SceneIntersections:
-    """Names the intersections that are checked by prims and elements.
+) -> list[SceneIntersections]:
+    """Names the intersections of some times that are checked by prims and elements.
 
     Excluded are edges and faces that the selection excludes or ignores, and those of a mesh with itself if only its
     transform moves it: where its parts touch, rounding of its positions would make them cross. Meshes that never move
@@ -162,24 +208,21 @@ def name_intersections(
     Args:
         segment: The segment.
         mesh: The detector's mesh, made of the segment.
-        found: Its intersections.
-        inside: The parts inside other meshes, of the pairs that are checked.
-        x: Positions of the segment's vertices, shape [vertex_count, 3].
-        time: Time code.
+        moments: Each time code, the positions of the segment's vertices there, shape [vertex_count, 3], the
+            intersections of the mesh, and the parts inside other meshes, of the pairs that are checked.
         selection: The pairs of meshes that are checked.
     """
-    if not len(found.pairs) + len(inside.bodies):
-        return SceneIntersections(segment, **NO_PAIRS, time=time, crosses=found.crosses, x=x)
-    ends = mesh.edges[found.pairs[:, 0]].astype(np.int64)
-    faces = found.pairs[:, 1].astype(np.int64)
+    if not any(len(found.pairs) + len(inside.bodies) for _, _, found, inside in moments):
+        return [SceneIntersections(segment, **NO_PAIRS, time=t, crosses=at.crosses, x=x) for t, x, at, _ in moments]
+    copies = np.repeat(np.arange(len(moments)), [len(found.pairs) for _, _, found, _ in moments])
+    pairs = np.concatenate([found.pairs for _, _, found, _ in moments]).astype(np.int64)
+    ends, faces = mesh.edges[pairs[:, 0]].astype(np.int64), pairs[:, 1]
     edge_meshes, points, diagonal = segment.locate_edges(ends)
     face_meshes, polygons = segment.locate_faces(faces)
     meshes = np.stack([edge_meshes, face_meshes], axis=1)
     counted = selection.counted_pairs(segment.meshes, meshes) & ~segment.are_stiff(ends, face_meshes)
-    ignored = counted & selection.ignored_pairs(segment.meshes, meshes)
-    counted &= ~ignored
-    of_ignored = {names: number for names, (number,) in count_by_meshes(segment, meshes[ignored]).items()}
-    nowhere = np.full_like(faces, -1)
+    nowhere, shift = np.full_like(faces, -1), segment.vertex_count * copies[:, None]
+    xs = np.concatenate([x for _, x, _, _ in moments]) if len(moments) > 1 else moments[0][1]
     arrays = {
         "kind": np.full(len(faces), _EDGE_FACE),
         "elements": np.stack([np.where(diagonal, DIAGONAL, EDGE), np.full(len(faces), FACE)], axis=1),
@@ -187,14 +230,21 @@ def name_intersections(
         "indices": np.stack([points, np.stack([polygons, nowhere], axis=1)], axis=1),
         "vertices": np.stack([ends, np.full_like(ends, -1)], axis=1),
         "faces": np.stack([nowhere, faces], axis=1),
-        "position": _meeting_points(x[ends].astype(np.float64), x[mesh.faces[faces]].astype(np.float64)),
-        "crosses": found.crosses,
+        "position": _meeting_points(*(xs[own + shift].astype(np.float64) for own in (ends, mesh.faces[faces]))),
+        "crosses": np.concatenate([found.crosses for _, _, found, _ in moments]),
+        "ignored": counted & selection.ignored_pairs(segment.meshes, meshes),
+        "counted": counted,
     }
-    arrays = take_rows(arrays, counted)
-    if len(inside.bodies):
-        of_inside = _name_inside(segment, inside, x)
-        arrays = {name: np.concatenate([array, of_inside[name]]) for name, array in arrays.items()}
-    return SceneIntersections(segment, **arrays, time=time, x=x, ignored=of_ignored)
+    named = []
+    for (time, x, _, inside), part in zip(moments, split_rows(arrays, copies, len(moments)), strict=True):
+        ignored, counted = part.pop("ignored"), part.pop("counted")
+        of_ignored = {names: n for names, (n,) in count_by_meshes(segment, part["meshes"][ignored]).items()}
+        rows = take_rows(part, counted & ~ignored)
+        if len(inside.bodies):
+            of_inside = _name_inside(segment, inside, x)
+            rows = {name: np.concatenate([array, of_inside[name]]) for name, array in rows.items()}
+        named.append(SceneIntersections(segment, **rows, time=time, x=x, ignored=of_ignored))
+    return named
 
 
 def _name_inside(segment: Segment, inside: Containment, x: np.ndarray) -> dict[str, np.ndarray]:

@@ -1,6 +1,7 @@
 """Pairs of elements of a scene's meshes, in the prims' own numbers."""
 
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import ClassVar, Self
 
 import numpy as np
@@ -94,27 +95,16 @@ class ScenePairs:
 
     def element_names(self, rows: slice) -> list[tuple[str, str]]:
         """Returns the elements of some pairs: ``"vertex 12"``, ``"face 3"``, ``"edge 4-5"`` or ``"diagonal 0-2"``."""
+        words, indices = np.array(ELEMENT_WORDS)[self.elements[rows]].T.tolist(), self.indices[rows].transpose(1, 0, 2)
         sides = [
-            [
-                f"{ELEMENT_WORDS[kind]} {first}" if second < 0 else f"{ELEMENT_WORDS[kind]} {first}-{second}"
-                for kind, first, second in zip(
-                    self.elements[rows, side].tolist(), *self.indices[rows, side].T.tolist(), strict=True
-                )
-            ]
-            for side in range(2)
+            [f"{word} {a}" if b < 0 else f"{word} {a}-{b}" for word, (a, b) in zip(own, numbers, strict=True)]
+            for own, numbers in zip(words, indices.tolist(), strict=True)
         ]
         return list(zip(*sides, strict=True))
 
     def element_indices(self, rows: slice) -> list[tuple[list[int], list[int]]]:
         """Returns the indices of the two elements of some pairs in their prims, one or two numbers each."""
-        sides = [
-            [
-                [first] if second < 0 else [first, second]
-                for first, second in zip(*self.indices[rows, side].T.tolist(), strict=True)
-            ]
-            for side in range(2)
-        ]
-        return list(zip(*sides, strict=True))
+        return [([a, b][: 1 + (b >= 0)], [c, d][: 1 + (d >= 0)]) for (a, b), (c, d) in self.indices[rows].tolist()]
 
     def triangles(self, rows: slice) -> list[int | None]:
         """Returns the number of each pair's face among the triangles of its polygon, from 0; None without a face."""
@@ -217,6 +207,16 @@ def name_elements(
 def take_rows(arrays: dict[str, np.ndarray], which: np.ndarray) -> dict[str, np.ndarray]:
     """Returns some rows of arrays, given which, bool; the arrays themselves for all rows."""
     return arrays if which.all() else {name: array[which] for name, array in arrays.items()}
+
+
+def split_rows(arrays: dict[str, np.ndarray], copies: np.ndarray, count: int) -> list[dict[str, np.ndarray]]:
+    """Returns the rows of arrays that belong to each of some copies, given the copy of each row, in their order."""
+    if count == 1:
+        return [arrays]
+    order = np.argsort(copies, kind="stable")
+    bounds = np.searchsorted(copies[order], np.arange(count + 1)).tolist()
+    ordered = {name: array[order] for name, array in arrays.items()}
+    return [{name: array[a:b] for name, array in ordered.items()} for a, b in pairwise(bounds)]
 
 
 def are_stiff_pairs(segment: Segment, vertices: np.ndarray, face_meshes: np.ndarray, ends: np.ndarray) -> np.ndarray:

@@ -386,17 +386,7 @@ def _joined(times: Iterable[dict[tuple[str, ...], _Span]], join: Callable[[_Span
 def _span(inside, meshes, samples, is_open, becomes) -> IntersectionSpan:
     """Returns a span of samples: time, crossings, and touches or parts inside each."""
     numbers = [crossings + touches for _, crossings, touches in samples]
-    most = max(numbers)
-    return IntersectionSpan(
-        meshes=meshes,
-        since=samples[0][0],
-        until=samples[-1][0],
-        is_open=is_open,
-        inside=inside,
-        becomes=becomes,
-        first=numbers[0],
-        last=numbers[-1],
-        most=most,
-        most_at=samples[numbers.index(most)][0],
-        crossings=max(crossings for _, crossings, _ in samples),
-    )
+    most, crossings = max(numbers), max(crossings for _, crossings, _ in samples)
+    most_at, times = samples[numbers.index(most)][0], (samples[0][0], samples[-1][0])
+    state, number = (is_open, inside, becomes), (numbers[0], numbers[-1], most)
+    return IntersectionSpan(meshes, *times, *state, *number, most_at, crossings)

@@ -38,12 +38,13 @@ curves pass through faces, vertices of parts that are inside others, middles of 
 LIFT = 2e-4
 """Distance of the coloured polygons from those of the scene, as a share of the size of its moving meshes."""
 
+_KINDS = ("VertexFace", "EdgeEdge", "VertexEdge", "VertexVertex")
 MOST_PAIRS = 32
 """Largest number of pairs of meshes with a prim of their own; the prim ``Rest`` has the others."""
 
 VARIANTS = {
     "all": tuple(COLORS),
-    "collisions": ("Polygons", "VertexFace", "EdgeEdge", "VertexEdge", "VertexVertex"),
+    "collisions": ("Polygons", *_KINDS),
     "intersections": ("Intersections", "CurveIntersections", "Inside"),
     "clearance": ("Near",),
 }
@@ -69,10 +70,7 @@ _ELEMENTS = {
 _CONTACTS = _MARKERS | {"primvars:toi": "float[]"} | _ELEMENTS
 _PARTS: dict[str, tuple[PrimKind, dict[str, str]]] = {
     "Polygons": ("Mesh", _EXTENT | {"faceVertexCounts": "int[]", "faceVertexIndices": "int[]", "points": "point3f[]"}),
-    "VertexFace": ("PointInstancer", _CONTACTS),
-    "EdgeEdge": ("PointInstancer", _CONTACTS),
-    "VertexEdge": ("PointInstancer", _CONTACTS),
-    "VertexVertex": ("PointInstancer", _CONTACTS),
+    **dict.fromkeys(_KINDS, ("PointInstancer", _CONTACTS)),
     "Intersections": (
         "BasisCurves",
         _EXTENT
@@ -162,7 +160,7 @@ class Overlay(ReplayOutput):
             of_pair = contacts.take(rows)
             if polygons := self._find_polygons(of_pair):
                 found[pair, "Polygons"] = polygons
-            for kind, name in enumerate(("VertexFace", "EdgeEdge", "VertexEdge", "VertexVertex")):
+            for kind, name in enumerate(_KINDS):
                 if len(of_kind := np.flatnonzero(of_pair.kind == kind)):
                     found[pair, name] = self._find_points(of_pair, of_kind, {"toi": of_pair.toi})
         self._spool.add(contacts.interval.start, found | self._find_at_rest(result, 0))
@@ -317,12 +315,8 @@ class Overlay(ReplayOutput):
 
     def _facts(self, summary: Summary) -> dict[str, Any]:
         """Returns what programs read of the layer without its prims."""
-        facts = {
-            "command": self._command,
-            "complete": summary.is_complete,
-            "hits": summary.hits,
-            "intervals": len(summary.intervals),
-        }
+        facts = {"command": self._command, "complete": summary.is_complete, "hits": summary.hits}
+        facts["intervals"] = len(summary.intervals)
         if missing := not_listed(summary, with_end=True):
             facts["limit"] = missing.limit
             facts["collisionsNotListed"] = missing.collisions[0]

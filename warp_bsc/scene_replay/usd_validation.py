@@ -30,11 +30,8 @@ PLUGIN_FOLDER = os.path.join(os.path.dirname(__file__), "plugin", "")
 """Folder of the plugin, for ``PXR_PLUGINPATH_NAME``."""
 
 
-_KINDS = {
-    "Inside": UsdValidation.ValidationErrorType.Warn,
-    "Duplicates": UsdValidation.ValidationErrorType.Warn,
-    "Meant": UsdValidation.ValidationErrorType.Info,
-}
+_KINDS: dict[str, UsdValidation.ValidationErrorType] = {"Meant": UsdValidation.ValidationErrorType.Info}
+_KINDS |= dict.fromkeys(("Inside", "Duplicates"), UsdValidation.ValidationErrorType.Warn)
 
 
 def find_errors(stage: Usd.Stage, time_range: UsdValidation.ValidationTimeRange) -> list[UsdValidation.ValidationError]:

@@ -13,6 +13,7 @@ from pxr import Gf, Tf, Usd
 from pxr.Usdviewq.plugin import PluginContainer
 
 from ..usd.interval import Interval
+from ..usd.read.triage import select_by_triage
 from ..usd.scene import Scene
 from .checking import Checks, IntervalChecker
 from .results import IntervalResult
@@ -46,6 +47,7 @@ class Hits:
 
     def __init__(self):
         self._checker: IntervalChecker | None = None
+        self._triage = ""  # the triage file that was read
         self._index = -1  # of the interval
         self._contacts: SceneContacts | None = None
         self._order = np.zeros(0, dtype=np.int64)  # rows of the contacts by time
@@ -57,7 +59,7 @@ class Hits:
         self._index = self._interval_at(scene, api.frame)
         self._shown = -1
         result = self._check(self._index)
-        api.PrintStatus(_describe(result))
+        api.PrintStatus(_describe(result, self._triage))
 
     def show_next(self, api: Any) -> None:
         """Shows the next collision: goes to its time, selects both prims and frames it.
@@ -119,7 +121,8 @@ class Hits:
         self._checker, self._index, self._contacts, self._shown = None, -1, None, -1
         api.PrintStatus("warp-bsc: reading the stage")
         api.qMainWindow.repaint()
-        scene = Scene(api.stage)
+        self._triage, selection = select_by_triage(api.stage)
+        scene = Scene(api.stage, selection=selection)
         checks = Checks(scene.selection, "exact", None, intersections=True, clearance=None, validate=0)
         self._checker = IntervalChecker(scene, checks)
         return scene
@@ -179,8 +182,8 @@ def _reporting(run: Callable[[Any], None]) -> Callable[[Any], None]:
     return command
 
 
-def _describe(result: IntervalResult) -> str:
-    """Returns what an interval contains, in words."""
+def _describe(result: IntervalResult, triage: str) -> str:
+    """Returns what an interval contains, and what a triage file excludes, in words."""
     summary, text = result.summary, ""
     if summary.earliest:
         text = f", the first at {summary.earliest.time:g}"
@@ -191,6 +194,7 @@ def _describe(result: IntervalResult) -> str:
         )
     if summary.inverted:
         text += f"; {sum(found.number for found in summary.inverted):,} inverted tetrahedra"
+    text += f"; {sum(summary.ignored.values()):,} more are meant by {triage}" if triage else ""
     return f"warp-bsc: from {summary.start:g} to {summary.end:g} {summary.hits:,} collisions{text}"
 
 

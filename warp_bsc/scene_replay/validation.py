@@ -6,10 +6,10 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from .. import checker
+from .._sorted_keys import expand_in_chunks
 from ..detection.detector import CollisionDetector, Collisions
 from ..detection.queries.query_points import query_points
 
-_CHUNK = 1 << 18  # pairs in memory at a time
 _FEWEST = 1 << 14  # fewest pairs in a call of the checker, as long as there are more: each call has a fixed cost
 _NEIGHBOURS = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 
@@ -107,14 +107,8 @@ def validate(
 
     counts = collisions.stats.vertex_face, collisions.stats.edge_edge
     decided = sum(count.candidates for count in counts)
-    return Validation(
-        hits=decided_hits,
-        others=decided_others,
-        decided=decided,
-        certified=decided - sum(count.unsure for count in counts),
-        disagreements=tuple(disagreements),
-        false_hits=false_hits,
-    )
+    certified = decided - sum(count.unsure for count in counts)
+    return Validation(decided_hits, decided_others, decided, certified, tuple(disagreements), false_hits)
 
 
 def _unreported(mesh, kind, first, second, found, x0, x1) -> Iterator[np.ndarray]:
@@ -153,7 +147,7 @@ def overlapping_boxes(
     both = np.concatenate([*first, *second])
     if not len(first[0]) or not len(second[0]):
         return
-    origin = both.min(axis=0)
+    origin, weights = both.min(axis=0), np.array([1 << 42, 1 << 21, 1])
     smallest = max(np.ptp(both, axis=0).max() * 2.0**-20, np.finfo(np.float64).tiny)  # cells fit into 21 bits
 
     def by_size(low, high):
@@ -165,39 +159,19 @@ def overlapping_boxes(
             cell = smallest * 2.0 ** max(size_a, size_b) * (1.0 + 1e-6)  # cells are numbered with rounding
             cells_a = np.floor((first[0][a] - origin) / cell).astype(np.int64)
             cells_b = np.floor((second[0][b] - origin) / cell).astype(np.int64)
-            keys = _cell_keys(cells_b)
+            keys = (cells_b + 1) @ weights
             order = np.argsort(keys, kind="stable")
             keys = keys[order]
             for step in _NEIGHBOURS:
-                neighbours = _cell_keys(cells_a + step)
+                neighbours = (cells_a + step + 1) @ weights
                 begin, end = np.searchsorted(keys, neighbours), np.searchsorted(keys, neighbours, side="right")
-                for rows, columns in _expand(begin, end):
+                for rows, columns in expand_in_chunks(begin, end):
                     i, j = a[rows], b[order[columns]]
                     for axis in range(3):
                         overlap = first[0][i, axis] <= second[1][j, axis]
                         overlap &= second[0][j, axis] <= first[1][i, axis]
                         i, j = i[overlap], j[overlap]
                     yield i, j
-
-
-def _cell_keys(cells):
-    return (cells + 1) @ np.array([1 << 42, 1 << 21, 1])
-
-
-def _expand(begin, end) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yields rows and all indices from begin to end of each, about a chunk at a time."""
-    (rows,) = np.nonzero(end > begin)
-    counts = (end - begin)[rows]
-    totals = np.cumsum(counts)
-    at = 0
-    while at < len(rows):
-        before = totals[at - 1] if at else 0
-        stop = max(at + 1, int(np.searchsorted(totals, before + _CHUNK, side="right")))
-        some = counts[at:stop]
-        starts = np.cumsum(some) - some
-        columns = np.arange(some.sum()) - np.repeat(starts - begin[rows[at:stop]], some)
-        yield np.repeat(rows[at:stop], some), columns
-        at = stop
 
 
 def _merged(chunks: Iterator[np.ndarray]) -> Iterator[np.ndarray]:

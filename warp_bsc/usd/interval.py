@@ -1,6 +1,6 @@
 """The motion of a scene from one of its times to the next, and what reading it reveals, in notes and warnings."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -8,6 +8,7 @@ import numpy as np
 from .segment import Segment
 from .turns import Turn
 
+_LEFT_OUT, _MESSAGE = "left out: {}".format, "message of OpenUSD: {}".format
 _NAMED = 5  # largest number of parts left out, and of messages of OpenUSD, in the warnings
 
 
@@ -78,10 +79,10 @@ class ReadingRecord:
             missing: Parts that are missing and allowed to be, a sentence each.
             others: Sentences on unread contents and on changes to the motion.
         """
-        sentences = [*map(left_out_warning, reasons[:_NAMED])]
+        sentences = [*map(_LEFT_OUT, reasons[:_NAMED])]
         if len(reasons) > _NAMED:
             sentences.append(f"left out: {len(reasons) - _NAMED} more, {len(reasons)} in all")
-        sentences += map(message_warning, self.messages[:_NAMED])
+        sentences += map(_MESSAGE, self.messages[:_NAMED])
         sentences += missing[:_NAMED]
         if len(missing) > _NAMED:
             sentences.append(f"missing: {len(missing) - _NAMED} more, {len(missing)} in all")
@@ -142,20 +143,17 @@ class Interval:
     def warnings(self) -> tuple[str, ...]:
         """Sentences on the parts left out, messages of OpenUSD and jumps that reading this interval revealed."""
         return (
-            *(left_out_warning(part.reason) for part in self.notes.left_out),
-            *map(message_warning, self.notes.messages),
+            *(_LEFT_OUT(part.reason) for part in self.notes.left_out),
+            *map(_MESSAGE, self.notes.messages),
             *(jump_warning(name, [self.start]) for name in self.jumps),
         )
 
 
-def left_out_warning(reason: str) -> str:
-    """Returns the warning that a part is left out, for a reason."""
-    return f"left out: {reason}"
-
-
-def message_warning(message: str) -> str:
-    """Returns the warning that contains a message of OpenUSD."""
-    return f"message of OpenUSD: {message}"
+def positions_of(intervals: Sequence[Interval]) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the positions at the starts of intervals of one segment, one after the other, and those at the ends."""
+    if len(intervals) == 1:
+        return intervals[0].x0, intervals[0].x1
+    return np.concatenate([at.x0 for at in intervals]), np.concatenate([at.x1 for at in intervals])
 
 
 def jump_warning(name: str, times: Iterable[float]) -> str:

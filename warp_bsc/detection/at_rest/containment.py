@@ -2,19 +2,17 @@
 
 import functools
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from ... import checker
-from ..._sorted_keys import expand_ranges
+from ..._sorted_keys import expand_in_chunks, expand_ranges
 from ..mesh import CollisionMesh
 from .body_parts import BodyParts, pair_keys
 from .intersections import Intersections, points_on_faces
-
-_CHUNK = 1 << 20  # pairs in memory at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -315,7 +313,7 @@ def enclosing_boxes(
         for step in itertools.product((0, 1), repeat=axes):
             cells = of_inner - np.array(step) @ weights
             first, last = np.searchsorted(keys, cells), np.searchsorted(keys, cells, side="right")
-            for rows, places in _expand_in_chunks(first, last):
+            for rows, places in expand_in_chunks(first, last):
                 inner, outer = rows, members[places]
                 for axis in range(3):
                     kept = outer_low[outer, axis] <= low[inner, axis]
@@ -332,16 +330,3 @@ def _distances_along_x(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     normal = np.cross(sides[:, 1] - sides[:, 0], sides[:, 2] - sides[:, 0])
     with np.errstate(all="ignore"):
         return np.nan_to_num((sides[:, 0] * normal).sum(axis=1) / normal[:, 0], nan=np.inf)
-
-
-def _expand_in_chunks(first: np.ndarray, last: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yields what :func:`expand_ranges` returns, about a chunk at a time, without empty ranges."""
-    (ranges,) = np.nonzero(last > first)
-    totals = np.cumsum((last - first)[ranges])
-    at = 0
-    while at < len(ranges):
-        before = totals[at - 1] if at else 0
-        stop = max(at + 1, int(np.searchsorted(totals, before + _CHUNK, side="right")))
-        rows, places = expand_ranges(first[ranges[at:stop]], last[ranges[at:stop]])
-        yield ranges[at + rows], places
-        at = stop

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from ...kernels.signs import FREE, UNSURE
 from ..run.launch import launch_over, launch_over_queue, max_blocks
 from ..run.settings import UNLIMITED, Count, PairCounts, PairKind, capacity_for
 from .contact_buffer import ContactBuffer, make_contact_buffer
@@ -108,6 +109,20 @@ class NarrowPhase:
         buffers.keys, buffers.order, buffers.for_exact = self._keys, self._order, self._for_exact[0]
         buffers.second_bits, buffers.last_key = self._bits[1], self._last_key
         return buffers
+
+    def counts_by_world(self, worlds: np.ndarray) -> list[PairCounts]:
+        """Returns the counts of the last run, without arcs and numbers too wide, by world, given first elements'."""
+        total = PairCounts(*self.counts.numpy().tolist())
+        contacts, status = (values.numpy()[: total.contacts] for values in (self.contacts.pairs, self.contacts.status))
+        pairs = {
+            "queued": self.queue.numpy()[: total.queued],
+            "survivors": self._survivors.numpy()[: total.survivors],
+            "found": contacts[status != FREE],
+            "unsure": contacts[status == UNSURE],
+            "for_exact": contacts[self._for_exact[0].numpy()[: total.for_exact]],
+        }
+        counts = [np.bincount(worlds[rows[:, 0]], minlength=worlds.max() + 1).tolist() for rows in pairs.values()]
+        return [PairCounts(**dict(zip(pairs, of_world, strict=True))) for of_world in zip(*counts, strict=True)]
 
     @property
     def _last_key(self) -> int:

@@ -209,7 +209,7 @@ class _NearPairs:
     def _pairs(self, interval: Interval, end: np.ndarray) -> np.ndarray:
         """Returns a number for each pair that is too near on the way to some positions, int64."""
         found = self._detector.detect(interval.x0, end)
-        contacts = find_contacts(interval, self._mesh, found, self._selection)
+        (contacts,) = find_contacts([interval], self._mesh, found, self._selection)
         vertex_face, edge_edge = (pairs.astype(np.int64) @ _KEY for pairs in (found.vertex_face, found.edge_edge))
         keys = np.concatenate([vertex_face, -1 - edge_edge])[contacts.counted]
         return keys[~self._is_kept[contacts.meshes].all(axis=1)]
