@@ -172,18 +172,6 @@ class RigidMotion:
         turn = np.where(still, 0.0, vector / np.where(still, 1.0, sine) * angle)
         return cls(body, poses[0][:, :3], turn, tolerance=tolerance)
 
-    def reversed(self, x0: np.ndarray, x1: np.ndarray) -> "RigidMotion":
-        """Returns the motion back from positions at its end, float, shape [vertex_count, 3], to those at its start."""
-        (vertices,) = np.nonzero(self.body >= 0)
-        body, count = self.body[vertices], len(self.centre)
-        r = x0[vertices] - self.centre[body]
-        across, inward = _levers(r, self.turn[body])
-        angle = np.linalg.norm(self.turn[body], axis=1, keepdims=True)
-        centres = x1[vertices] - (r + np.sin(angle) * across + 2.0 * np.sin(0.5 * angle) ** 2 * inward)
-        total = np.stack([np.bincount(body, values, count) for values in centres.T], axis=1)
-        centre = total / np.maximum(np.bincount(body, minlength=count), 1)[:, None]
-        return RigidMotion(self.body, centre, -self.turn, tolerance=self.tolerance)
-
     def positions(self, x0: ArrayLike | wp.array, x1: ArrayLike | wp.array, time: float) -> np.ndarray:
         """Returns the positions of all vertices at a time, rounded, float64, shape [vertex_count, 3].
 

@@ -54,9 +54,8 @@ class NarrowPhase:
         device = self.counts.device
         keys, order = (wp.empty(2 * capacity, dtype=dtype, device=device) for dtype in (wp.int64, int))
         for_exact = [wp.empty(capacity, dtype=int, device=device) for _ in range(2)]
-        wp.empty(
-            capacity, dtype=wp.uint8, device=device
-        )  # which the sort takes then, and without which it does nothing
+        # the sort allocates as much later, and does nothing where that fails
+        wp.empty(capacity, dtype=wp.uint8, device=device)
         self.contacts, self._keys, self._order = make_contact_buffer(capacity, device), keys, order  # all or none
         self._for_exact = for_exact
 

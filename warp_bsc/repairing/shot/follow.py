@@ -189,9 +189,7 @@ class Follower:
         if is_free and largest < _STRAINED:
             return frame, after
         # Both motions lead to the frame: that to the frame after it backwards, which passes the same positions.
-        motions = [(before.x, frame.arcs)]
-        if after is not None:
-            motions.append((after.x, None if after.arcs is None else after.arcs.reversed(frame.x, after.x)))
+        motions = [(before.x, frame.arcs), *([] if after is None else [(after.x, None)])]
         springs, known = self._springs, frame.contacts
         springs.rest_at(frame.given.astype(np.float64), self.length)
         displaced = np.asarray((frame.x != frame.given).any(axis=1))
@@ -204,6 +202,8 @@ class Follower:
             for start, arcs in motions:
                 contacts, touched = self._contacts(start, x, changed, arcs)
                 known, collide = Contacts.joined([known, contacts]), collide | touched
+            if after is not None and after.arcs is not None:  # whose contacts are those of the chords
+                collide |= self._contacts(x, after.x, changed, after.arcs)[1]
             if collide.any():
                 failures += 1
                 if is_free and failures >= _FAILURES:
