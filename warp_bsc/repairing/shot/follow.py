@@ -33,13 +33,8 @@ _GAP = 0.005
 each other into the next ones."""
 _REACH = 0.07
 """Distance, as a share of that length, from which a contact of the frame before is none."""
-_LEAST_SPREAD = 0.2
-"""Share of the largest displacement by contacts from which spread ones are used: pushes of the two sides of a fold
-cancel where the sweeps reach from one to the other."""
 _SMALLEST = 1e-4
 """Displacement, as a share of that length, that is none: a contact does not reach all of a mesh."""
-_LARGEST_STEP = 1.0
-"""Largest displacement of a vertex that is spread, as a share of that length."""
 _EARLIEST = 0.06
 """Time of a contact on an arc, as a share of the step: an earlier one is resolved as one at this time."""
 _STRAINED = 0.095
@@ -158,16 +153,12 @@ class Follower:
             last, x = x, self._moved_apart(target, given, known)
             while sweeps and (is_free or number == 0):
                 residual = x - target
-                size = np.linalg.norm(residual, axis=1, keepdims=True)
-                if size.max(initial=0.0) < tolerance:
+                if np.linalg.norm(residual, axis=1).max(initial=0.0) < tolerance:
                     break
-                largest = _LARGEST_STEP * self.length
-                residual *= np.minimum(1.0, largest / np.maximum(size, largest))
                 spread = self._spread_out(residual, sweeps.pop(0))
-                if np.linalg.norm(spread, axis=1).max() > _LEAST_SPREAD * size.max():
-                    displacement = displacement + spread
-                    target = _displaced(given, displacement)
-                    x = self._moved_apart(target, given, known)
+                displacement = displacement + spread
+                target = _displaced(given, displacement)
+                x = self._moved_apart(target, given, known)
             changed = touched | (x.astype(np.float32) != last).any(axis=1)
         frame = ShotFrame(given, target, displacement, False, known, arcs) if best is None else best[1]
         if frame.certified:
