@@ -88,8 +88,13 @@ def test_layer_of_a_free_shot_shows_it_as_it_is(tmp_path, capsys):
 
 
 def test_frames_with_wrecked_edges_are_not_good(tmp_path, capsys):
-    """Free and certified is not enough: a status and a line tell, and the page begins with the worst one."""
+    """Free and certified is not enough: a status and a line tell, and the page begins with the worst one.
+
+    The dip cannot be repaired by a move of the whole sheet, as there is a lid above it.
+    """
     stage, page = dipping_sheet(tmp_path, dip=-6.0), tmp_path / "moves.html"
+    lid = sheet(0.2) * np.float32((9.0, 9.0, 1.0))
+    add_mesh(stage, "/World/Lid", [tuple(map(float, point)) for point in lid], [4] * SIZE**2, quads())
     output = repaired(stage, "--fail-on", "distorted", "--report", str(page), status=1)
     printed = capsys.readouterr().out
     assert "Not good: 1 frame, with edges shorter than a third of the shot's" in printed and ", 0 remain." in printed
