@@ -105,12 +105,7 @@ def _found(
 
 
 def free(
-    surface: Surface,
-    start: np.ndarray,
-    crossings: np.ndarray,
-    max_strain: float,
-    *,
-    movable: np.ndarray | None = None,
+    surface: Surface, start: np.ndarray, crossings: np.ndarray, max_strain: float, *, movable: np.ndarray | None = None
 ) -> np.ndarray:
     """Returns positions near the input at which less crosses, or is near, in units of the surface; or worse ones.
 

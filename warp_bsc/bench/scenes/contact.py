@@ -111,13 +111,7 @@ class SceneBuilder:
             self.to.add_cloth_grid(**options, **self._membrane(stiffness, mass))
 
     def add_cloth_mesh(
-        self,
-        points: np.ndarray,
-        faces: np.ndarray,
-        *,
-        density: float,
-        stiffness: float,
-        radius: float = 0.002,
+        self, points: np.ndarray, faces: np.ndarray, *, density: float, stiffness: float, radius: float = 0.002
     ):
         """Adds cloth that is at rest as it is given; the density is in kg/m^2."""
         if self.solver == "style3d":
@@ -204,10 +198,7 @@ class SceneBuilder:
 
 
 def _anisotropic(stiffness: float) -> dict[str, Any]:
-    return {
-        "tri_aniso_ke": wp.vec3(stiffness, stiffness, 0.1 * stiffness),
-        "edge_aniso_ke": wp.vec3(2e-5, 1e-5, 5e-6),
-    }
+    return {"tri_aniso_ke": wp.vec3(stiffness, stiffness, 0.1 * stiffness), "edge_aniso_ke": wp.vec3(2e-5, 1e-5, 5e-6)}
 
 
 def _ease(t: float) -> float:
@@ -285,10 +276,7 @@ def _build_soft_bowl(builder: SceneBuilder) -> Scene:
     """A soft block falls into a bowl."""
     inner, outer = (
         np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
-        for radius, angle in (
-            (0.15, np.linspace(-0.48 * np.pi, 0.0, 7)),
-            (0.17, np.linspace(0.0, -0.48 * np.pi, 7)),
-        )
+        for radius, angle in ((0.15, np.linspace(-0.48 * np.pi, 0.0, 7)), (0.17, np.linspace(0.0, -0.48 * np.pi, 7)))
     )
     points, faces = _revolve(np.concatenate([inner, outer]), 24)
     centres = [len(points), len(points) + 1]  # they close both ends of the profile

@@ -14,7 +14,7 @@ from ...detection.run.launch import launch, launch_in_turn
 from ..contacts import Contacts, as_contacts, projected
 from ..elastic import Springs
 from ..surface import Surface
-from .follow_kernels import find_directions, normalize, smooth
+from .follow_kernels import find_directions, smooth
 from .stretch import ShotFrame, edge_ratios
 
 if TYPE_CHECKING:
@@ -33,6 +33,9 @@ _GAP = 0.005
 each other into the next ones."""
 _REACH = 0.07
 """Distance, as a share of that length, from which a contact of the frame before is none."""
+_PEAK = 0.5
+"""Weight that stays at a single vertex after one sweep, times the number of sweeps: on a triangle mesh, the peak of the
+Gaussian falls with their number."""
 _SMALLEST = 1e-4
 """Displacement, as a share of that length, that is none: a contact does not reach all of a mesh."""
 _EARLIEST = 0.06
@@ -100,10 +103,8 @@ class Follower:
         first = np.concatenate([[0], np.cumsum(np.bincount(both[:, 0], minlength=len(x)))])
         self._first = wp.array(first, dtype=int, device=self._device)
         self._neighbours = wp.array(both[order, 1], dtype=int, device=self._device)
-        self._movable = wp.array(is_movable, dtype=wp.bool, device=self._device)
         self._values = wp.empty(len(x), dtype=wp.vec4, device=self._device)
         self._smoothed = wp.empty_like(self._values)
-        self._spread = wp.empty(len(x), dtype=wp.vec3, device=self._device)
 
     def follow(
         self,
@@ -308,21 +309,18 @@ class Follower:
         return Playback(self.mesh, self._x, self._is_movable, self._min_distance)
 
     def _spread_out(self, displacement, sweeps) -> np.ndarray:
-        """Returns the displacements of some vertices, and of those around them."""
+        """Returns the displacements of some vertices, and of those around them.
+
+        Sweeps make a Gaussian of the displacements and one of their weights, and the quotient counts: where many
+        vertices are displaced it is their mean, and around a single one it decreases with the distance.
+        """
         weights = (displacement != 0.0).any(axis=1, keepdims=True)
         self._values.assign(np.concatenate([displacement, weights], axis=1).astype(np.float32))
-        inputs = [self._first, self._neighbours]
-        values = [self._values, self._smoothed]
-        smoothed = launch_in_turn(smooth, len(weights), sweeps, inputs=inputs, values=values)
-        launch(
-            normalize,
-            len(weights),
-            inputs=[smoothed, sweeps, self._movable],
-            outputs=[self._spread],
-            device=self._device,
-        )
-        spread = self._spread.numpy().astype(np.float64)
-        return np.where(np.linalg.norm(spread, axis=1, keepdims=True) < _SMALLEST * self.length, 0.0, spread)
+        inputs, values = [self._first, self._neighbours], [self._values, self._smoothed]
+        smoothed = launch_in_turn(smooth, len(weights), sweeps, inputs=inputs, values=values).numpy().astype(np.float64)
+        spread = smoothed[:, :3] / np.maximum(smoothed[:, 3:], _PEAK / sweeps)
+        spread[~self._is_movable | (np.linalg.norm(spread, axis=1) < _SMALLEST * self.length)] = 0.0
+        return spread
 
 
 def _turns(contacts: Contacts, arcs: RigidMotion) -> np.ndarray:

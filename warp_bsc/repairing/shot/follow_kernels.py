@@ -13,10 +13,6 @@ _SOONER = wp.constant(wp.float64(0.25))
 _SOONER_GAPS = wp.constant(wp.float64(2.0))
 """Largest relative motion in between, as a multiple of the gap that the contact is to have."""
 
-_PEAK = wp.constant(0.5)
-"""Weight that stays at a single vertex after one sweep of :func:`smooth`, times the number of sweeps: on a triangle
-mesh, the sweeps make a Gaussian whose peak falls with their number."""
-
 
 @wp.kernel
 def smooth(
@@ -37,27 +33,6 @@ def smooth(
     smoothed[i] = values[i]
     if count > 0:
         smoothed[i] = 0.5 * (values[i] + total / float(count))
-
-
-@wp.kernel
-def normalize(
-    # in
-    values: wp.array[wp.vec4],
-    sweeps: int,
-    is_movable: wp.array[wp.bool],
-    # out
-    displacement: wp.array[wp.vec3],
-):
-    """Divides smoothed displacements by their smoothed weights, at least by the weight of a single vertex.
-
-    Where many vertices are displaced the result is their mean; around a single one it decreases with the distance.
-    """
-    i = wp.tid()
-    displacement[i] = wp.vec3()
-    if is_movable[i]:
-        value = values[i]
-        weight = wp.max(value[3], _PEAK / float(sweeps))
-        displacement[i] = wp.vec3(value[0], value[1], value[2]) / weight
 
 
 @wp.func
