@@ -317,8 +317,8 @@ class Follower:
         weights = (displacement != 0.0).any(axis=1, keepdims=True)
         self._values.assign(np.concatenate([displacement, weights], axis=1).astype(np.float32))
         inputs, values = [self._first, self._neighbours], [self._values, self._smoothed]
-        smoothed = launch_in_turn(smooth, len(weights), sweeps, inputs=inputs, values=values).numpy().astype(np.float64)
-        spread = smoothed[:, :3] / np.maximum(smoothed[:, 3:], _PEAK / sweeps)
+        smoothed = launch_in_turn(smooth, len(weights), sweeps, inputs=inputs, values=values).numpy()
+        spread = (smoothed[:, :3] / np.maximum(smoothed[:, 3:], np.float32(_PEAK / sweeps))).astype(np.float64)
         spread[~self._is_movable | (np.linalg.norm(spread, axis=1) < _SMALLEST * self.length)] = 0.0
         return spread
 
