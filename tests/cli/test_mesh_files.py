@@ -241,7 +241,7 @@ def test_seams_stay_closed(folder, capsys):
         (["balls.obj", "--output", "free.obj", "--frames", "1:2"], "--frames is not for mesh files"),
         (["balls.obj", "--output", "free.obj", "--fail-on", "distorted"], "--fail-on distorted is for shots"),
         (["demo", "--output", "free.usda", "--order"], "--order is not for USD scenes"),
-        (["demo", "--output", "free.usda", "--rigid", "*"], "--rigid is not for USD scenes"),
+        (["demo", "--output", "free.usda", "--rigid", "x*"], "--rigid: no mesh matches x*"),
         (["balls.obj", "--output", "free.obj", "--rigid", "x*"], "--rigid: no file matches x*"),
         (["demo", "--output", "free.usda", "--max-strain", "0.5"], "--max-strain is not for USD scenes"),
         (["balls.obj", "--output", "free.obj", "--previous", "first.obj"], "--previous: the files must have the faces"),

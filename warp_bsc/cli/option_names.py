@@ -4,7 +4,7 @@ import re
 
 _NAMES = (
     "allow_missing between clearance count exclude frames ignore ignore_initial intersections keep kind max_move "
-    "max_strain method min_distance prims subdivide triage validate workers"
+    "max_strain method min_distance prims rigid subdivide triage validate workers"
 )
 _OPTIONS = {name: f"--{name.replace('_', '-')}" for name in _NAMES.split()}
 _OPTIONS |= {"purposes": "--purpose", "self_collisions": "--self", "x_previous": "--previous"}
