@@ -9,7 +9,7 @@ from .._atomic_file import STDOUT, unfinished_path
 from ..mesh_files.file_scene import FileScene, FrameFiles
 from ..mesh_files.frames import find_frames, make_folder
 from ..mesh_files.mesh_file import is_mesh_file
-from ..repairing.shot.findings import count_found, kept_meshes
+from ..repairing.shot.findings import count_found, kept_meshes, matching_meshes
 from ..repairing.shot.report import RepairPage
 from ..scene_replay.hit_files import replay_facts
 from ..usd.read.tetrahedra import NOT_REPAIRED
@@ -168,6 +168,7 @@ def _run(arguments: argparse.Namespace) -> int:
     else:
         scene, outputs = _open_usd(arguments, chosen), []
     kept = kept_meshes(scene, arguments.keep)
+    matching_meshes(scene, arguments.rigid, "rigid")  # fails before anything is written
     with loading_kernels(device):
         load_detector("exact", scene.dtype, device, intersections=True, strands=scene.has_strands)
     options = describe_selection(scene, arguments)
