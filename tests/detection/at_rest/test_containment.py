@@ -5,7 +5,8 @@ import pytest
 import trimesh
 
 import warp_bsc as bsc
-from warp_bsc import _sorted_keys, checker
+from warp_bsc import checker
+from warp_bsc.detection.at_rest import containment
 from warp_bsc.detection.at_rest.containment import ContainmentFinder
 
 BOX = trimesh.creation.box(bounds=[(0, 0, 0), (1, 1, 1)])
@@ -168,7 +169,7 @@ def test_only_wanted_pairs_are_looked_for():
 
 def test_many_bodies(monkeypatch):
     """Boxes in two sizes, each small one in a large one, and one around all."""
-    monkeypatch.setattr(_sorted_keys, "_CHUNK", 100)
+    monkeypatch.setattr("warp_bsc._sorted_keys._CHUNK", 100)
     places = np.stack(np.meshgrid(*[np.arange(6.0)] * 3), axis=-1).reshape(-1, 3) * 2.0
     solids = [box(place, place + 1) for place in places]
     solids += [box(place + 0.25, place + 0.75) for place in places] + [box((-1, -1, -1), (12, 12, 12))]
