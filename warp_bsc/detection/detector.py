@@ -137,7 +137,7 @@ class CollisionDetector:
         return self._finder.find(x0, x1, changed=changed)
 
     @one_at_a_time
-    def stats_by_world(self, collisions: Collisions) -> list[DetectionStats] | None:
+    def _stats_by_world(self, collisions: Collisions) -> list[DetectionStats] | None:
         """Returns the counts of the last detection in each world of a mesh of faces, and the times of all.
 
         They are not known, None, if the exponents of a pair are too far apart for two limbs.

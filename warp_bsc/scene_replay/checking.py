@@ -244,7 +244,7 @@ class _SegmentDetector:
             collisions = detector.detect(np.zeros((0, 3)), np.zeros((0, 3)))
         else:
             collisions = detector.detect(x0, x1, rigid_motion=arcs)
-        stats = [collisions.stats] if len(intervals) == 1 else detector.stats_by_world(collisions)
+        stats = [collisions.stats] if len(intervals) == 1 else detector._stats_by_world(collisions)
         if stats is None:
             for one in intervals:
                 yield from self.detect([one])
