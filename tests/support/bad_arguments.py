@@ -484,7 +484,13 @@ def calls_of_scenes() -> dict[str, Call]:
                 "clearance": without(POSITIVE, "None"),
                 "validate": {**NOT_COUNT, "word": "some", "empty": ""},
                 "earlier": {"None": None, "number": 3},
-                "workers": {**without(NOT_COUNT, "None"), "zero": 0, "word": "head", "no host": "tcp://", "list": ["tcp://head"]},
+                "workers": {
+                    **without(NOT_COUNT, "None"),
+                    "zero": 0,
+                    "word": "head",
+                    "no host": "tcp://",
+                    "list": ["tcp://head"],
+                },
             },
         ),
     }
