@@ -73,8 +73,7 @@ examples:
 
 {explain_statuses(ExitStatus.FOUND, ExitStatus.LEFT_OUT, ExitStatus.EMPTY)}"""
 
-_OF_ALL = {"command_line", "scene", "output", "report", "keep", "rigid", "min_distance", "json"}
-_OF_ALL |= {"fail_on", "device"}
+_OF_ALL = {"command_line", "scene", "output", "report", "keep", "rigid", "min_distance", "json", "fail_on", "device"}
 _OF_ONE_FRAME = {"max_strain", "order", "previous"}
 _OF_FRAMES = {"max_move", "resume"}
 """The options for everything, for mesh files of one frame alone, and for several frames. Others are for USD alone."""

@@ -137,23 +137,6 @@ class CollisionDetector:
         return self._finder.find(x0, x1, changed=changed)
 
     @one_at_a_time
-    def _stats_by_world(self, collisions: Collisions) -> list[DetectionStats] | None:
-        """Returns the counts of the last detection in each world of a mesh of faces, and the times of all.
-
-        They are not known, None, if the exponents of a pair are too far apart for two limbs.
-
-        Args:
-            collisions: The result of that detection, without ``rigid_motion``.
-        """
-        pipeline, mesh = self._pipeline, self.mesh
-        if any(counts.too_wide_2 for counts in pipeline.counts.pairs.values()):
-            return None
-        assert mesh.world is not None
-        worlds = mesh.world, mesh.world[mesh.edges[:, 0]]
-        counts = [phase.counts_by_world(of) for phase, of in zip(pipeline.narrow_phases, worlds, strict=True)]
-        return [replace(collisions, _counts=Counts(0, 0, *both)).stats for both in zip(*counts, strict=True)]
-
-    @one_at_a_time
     def collision_free_step(self, x0: ArrayLike | wp.array, x1: ArrayLike | wp.array) -> FreeStep:
         """Returns how far a motion goes before its first collision, and the positions there.
 
@@ -397,3 +380,21 @@ def _like(x: np.ndarray, given: ArrayLike | wp.array) -> np.ndarray | wp.array:
     if not isinstance(given, wp.array):
         return x
     return wp.array(x, dtype=wp.vec3 if x.dtype == np.float32 else wp.vec3d, device=given.device)
+
+
+def stats_by_world(detector: CollisionDetector, collisions: Collisions) -> list[DetectionStats] | None:
+    """Returns the counts of the last detection in each world of a mesh of faces, and the times of all.
+
+    They are not known, None, if the exponents of a pair are too far apart for two limbs.
+
+    Args:
+        detector: The detector.
+        collisions: The result of that detection, without ``rigid_motion``.
+    """
+    pipeline, mesh = detector._pipeline, detector.mesh
+    if any(counts.too_wide_2 for counts in pipeline.counts.pairs.values()):
+        return None
+    assert mesh.world is not None
+    worlds = mesh.world, mesh.world[mesh.edges[:, 0]]
+    counts = [phase.counts_by_world(of) for phase, of in zip(pipeline.narrow_phases, worlds, strict=True)]
+    return [replace(collisions, _counts=Counts(0, 0, *both)).stats for both in zip(*counts, strict=True)]

@@ -16,7 +16,7 @@ from ..detection.arcs.rigid_motion import RigidMotion
 from ..detection.at_rest.containment import ContainmentFinder
 from ..detection.at_rest.intersections import Intersections
 from ..detection.at_rest.proximities import Proximities, ProximityFinder
-from ..detection.detector import CollisionDetector
+from ..detection.detector import CollisionDetector, stats_by_world
 from ..detection.inversions import Inversions
 from ..detection.mesh import CollisionMesh
 from ..detection.results.collisions import Collisions, DetectionStats, add_stats
@@ -244,7 +244,7 @@ class _SegmentDetector:
             collisions = detector.detect(np.zeros((0, 3)), np.zeros((0, 3)))
         else:
             collisions = detector.detect(x0, x1, rigid_motion=arcs)
-        stats = [collisions.stats] if len(intervals) == 1 else detector._stats_by_world(collisions)
+        stats = [collisions.stats] if len(intervals) == 1 else stats_by_world(detector, collisions)
         if stats is None:
             for one in intervals:
                 yield from self.detect([one])

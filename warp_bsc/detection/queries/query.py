@@ -116,9 +116,7 @@ def query_vertex_face(
             there is a minimum distance.
         RuntimeError: With ``out``: if a GPU captures a graph before the first such call.
     """
-    if out is not None:
-        return _query_into(out, PairKind.VERTEX_FACE, points, min_distance, method, toi, tolerance, device)
-    return _query(PairKind.VERTEX_FACE, points, min_distance, method, toi, tolerance, device)
+    return _query(PairKind.VERTEX_FACE, points, min_distance, method, toi, tolerance, device, out)
 
 
 @_typed
@@ -137,9 +135,7 @@ def query_edge_edge(
     The points have shape [n, 8, 3], rows a0 b0 c0 d0 a1 b1 c1 d1: edges a b and c d at the start (0) and at the end (1)
     of the step.
     """
-    if out is not None:
-        return _query_into(out, PairKind.EDGE_EDGE, points, min_distance, method, toi, tolerance, device)
-    return _query(PairKind.EDGE_EDGE, points, min_distance, method, toi, tolerance, device)
+    return _query(PairKind.EDGE_EDGE, points, min_distance, method, toi, tolerance, device, out)
 
 
 def query_vertex_edge(
@@ -192,7 +188,9 @@ def _query_into(out, kind, points, min_distance, method, timed, tolerance, devic
     return out
 
 
-def _query(kind, points, min_distance, method, timed, tolerance, device) -> QueryResult:
+def _query(kind, points, min_distance, method, timed, tolerance, device, out=None) -> Any:
+    if out is not None:
+        return _query_into(out, kind, points, min_distance, method, timed, tolerance, device)
     checked_choice(method, "method", METHODS)
     tolerance = checked_tolerance(tolerance)
     timed = checked_flag(timed, "toi")
