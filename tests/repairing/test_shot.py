@@ -16,6 +16,7 @@ from warp_bsc import CollisionDetector, CollisionMesh, Scene, replay
 from warp_bsc.cli.main import main
 from warp_bsc.repairing.shot.blend import BLEND, blend
 from warp_bsc.repairing.shot.findings import find_collisions
+from warp_bsc.repairing.shot.follow import Follower
 from warp_bsc.repairing.shot.mesh_groups import groups_of
 from warp_bsc.repairing.shot.repair_shot import repair_shot
 from warp_bsc.repairing.shot.stretch import ShotFrame, StretchRecorder
@@ -117,6 +118,30 @@ def test_springs_relax_what_contacts_strain(tmp_path, capsys, dip):
     (stretch,) = found["stretches"]
     assert found["remaining"] == {"collisions": 0, "intersections": 0} and not stretch["uncertified"]
     assert stretch["edge_ratio"][0] > 0.9 and stretch["edge_ratio"][1] < 1.1
+
+
+@pytest.mark.parametrize(("bottom", "lowest", "highest"), [(0.2, 0.3, 0.4), (0.6, 0.45, 0.55)])
+def test_a_frame_is_relaxed_only_as_far_as_the_next_one_can_be_reached(bottom, lowest, highest):
+    """A fin passes above the tip of a sheet halfway to the next frame, in which the sheet is flat: springs would raise
+    the tip to 0.5, where it is in the shot, and it may be at twice the height of the fin at most.
+    """
+    n = SIZE + 1
+    tip, fin = n * n // 2, np.array([(0, -0.5, bottom), (0, 0.5, bottom), (0, 0, bottom + 1.0)])
+    faces = [*np.array(quads()).reshape(-1, 4)[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3), np.arange(3) + n * n]
+
+    def frame(height, fin_at, given=None):
+        x = np.concatenate([sheet(0.0), fin + np.array([fin_at, 0, 0])]).astype(np.float32)
+        x[tip, 2] = height
+        return ShotFrame(x if given is None else given, x, np.zeros_like(x))
+
+    mesh = CollisionMesh(faces, n * n + 3, device="cpu")
+    before, after = frame(0.3, -9.0), frame(0.0, 3.0)
+    follower = Follower(mesh, before.x, np.arange(n * n + 3) < n * n)
+    relaxed, following = follower.relax(before, frame(0.3, -3.0, frame(0.5, -3.0).x), after)
+    assert relaxed.certified and following.certified
+    detector = CollisionDetector(mesh, method="exact")
+    assert not len(detector.detect(before.x, relaxed.x)) and not len(detector.detect(relaxed.x, after.x))
+    assert lowest <= relaxed.x[tip, 2] <= highest
 
 
 @pytest.mark.parametrize("rigid", [["--rigid", "*Button*"], []])
