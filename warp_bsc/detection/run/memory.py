@@ -24,11 +24,11 @@ class DeviceMemoryError(MemoryError, RuntimeError):
 def _explain(device: wp.Device, shape: tuple[int, ...], dtype: Any) -> DeviceMemoryError | None:
     """Returns the error of an array for which there is no memory, None if nothing in this package allocates it."""
     stack = [(Path(frame.f_code.co_filename), frame.f_code.co_qualname, at) for frame, at in traceback.walk_stack(None)]
-    stack = [(path, name.partition(".<locals>")[0], at) for path, name, at in stack]
     places = [place for place in stack if _PACKAGE in place[0].parents and place[0] != Path(__file__)]
     if not places:
         return None
-    file, function, line = next((place for place in places if "." in place[1]), places[0])
+    file, function, line = next((place for place in places if "." in place[1].partition(".<locals>")[0]), places[0])
+    function = function.partition(".<locals>")[0]
     called = [name.removesuffix(".__init__") for path, name, _ in places if path.parent.name != "cli"]
     public = [name for name in called if not re.search(r"(^|\.)[_<]", name)]
     target, is_assignment, _ = linecache.getline(str(file), line).strip().partition(" = ")
