@@ -381,7 +381,7 @@ class _StrandChecker:
         )
         self._detector = CollisionDetector(self.mesh, method=checks.method)
         self._finder = self._detector.intersection_finder() if checks.intersections else None
-        self._edges_of_faces = np.setdiff1d(np.arange(len(self.mesh.edges)), self.mesh.free_edges)
+        self._edges_of_faces = np.delete(np.arange(len(self.mesh.edges)), self.mesh.free_edges)
 
     @property
     def bodies(self) -> np.ndarray:

@@ -41,7 +41,7 @@ class BroadPhaseSimd:
         if mesh.only_free:
             self._vertices = of_vertices(np.setdiff1d(mesh.vertices, mesh.faces))
             self._edges = of_edges(mesh.free_edges)
-            self._edges_of_faces = of_edges(np.setdiff1d(np.arange(len(mesh.edges)), mesh.free_edges))
+            self._edges_of_faces = of_edges(np.delete(np.arange(len(mesh.edges)), mesh.free_edges))
         else:
             self._vertices = of_vertices(mesh.vertices)
             self._edges = of_edges(np.arange(len(mesh.edges)))

@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from ..._arguments import checked_integer
-from ..._sorted_keys import expand_ranges
+from ..._sorted_keys import distinct, expand_ranges
 from ..mesh import CollisionMesh
 
 _MAX_NEIGHBOURS = 256
@@ -59,10 +59,10 @@ def make_rings(mesh: CollisionMesh, rings: int) -> Rings:
         return result
     n = mesh.vertex_count
     most = min(max(_MAX_PAIRS, _MAX_NEIGHBOURS * n), 2**31 - 1)
-    edges = np.unique(np.concatenate([mesh.edges, mesh.edges[:, ::-1]]).astype(np.int64), axis=0)
-    starts = np.searchsorted(edges[:, 0], np.arange(n + 1))
     # each pair (vertex, neighbour) is one number; those of a ring are neighbours of the ring before it
-    ring, before = edges @ np.array([n, 1]), np.arange(n) * (n + 1)
+    ring = distinct(np.concatenate([mesh.edges, mesh.edges[:, ::-1]]).astype(np.int64) @ np.array([n, 1]))
+    first, second = np.divmod(ring, max(1, n))
+    starts, before = np.searchsorted(first, np.arange(n + 1)), np.arange(n) * (n + 1)
     reached = [ring]
     while len(reached) < rings and len(ring):
         vertices, neighbours = np.divmod(ring, n)
@@ -70,7 +70,7 @@ def make_rings(mesh: CollisionMesh, rings: int) -> Rings:
         if sum(map(len, reached)) > most or degrees.sum() > 2 * most:
             break
         rows, places = expand_ranges(starts[neighbours], starts[neighbours + 1])
-        further = np.unique(vertices[rows] * n + edges[places, 1])
+        further = distinct(vertices[rows] * n + second[places])
         further = np.setdiff1d(further, ring, assume_unique=True)
         ring, before = np.setdiff1d(further, before, assume_unique=True), ring
         reached.append(ring)

@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 from pxr import Usd, UsdGeom
 
+from ..._sorted_keys import distinct
 from .instancers import is_shown, visibility_times
 from .mesh_prims import MeshPrim
 from .mesh_transforms import MeshTransforms
@@ -196,7 +197,7 @@ class UsdMesh:
             points = self.read_points(time)
             triangles, _, _ = self.read_triangles(time, points)
             self.read_strands([time], len(points))
-            used = np.arange(len(points)) if self.is_strands else np.unique(triangles)
+            used = np.arange(len(points)) if self.is_strands else distinct(triangles)
             self.read_positions(time, used=used, point_count=len(points), dtype=points.dtype)
         except UnreadableError:
             return False
