@@ -1,15 +1,15 @@
 """Meshes of grids that cross along a contour of each of seven kinds, and what their repair without a hint gives.
 
-Run it as ``python tests/support/contour_kinds.py [SIZE ...]``, by default 20, 60 and 200 vertices a side. It prints a
-row for each mesh: crossings, whether the result is certified, the largest strain, moves in median edge lengths, and the
-time of a second repair.
+Run it as ``python tests/support/contour_kinds.py [--device DEVICE] [SIZE ...]``, by default 20, 60 and 200 vertices a
+side on the CPU. It prints a row for each mesh: crossings, whether the result is certified, the largest strain, moves in
+median edge lengths, and the time of a second repair.
 
 References:
     Martin Wicke, Hermes Lanker, and Markus Gross. "Untangling Cloth with Boundaries." Vision, Modeling, and
     Visualization (2006), which tells the kinds apart.
 """
 
-import sys
+import argparse
 import time
 
 import numpy as np
@@ -114,16 +114,21 @@ KINDS = {
 
 def main():
     """Prints the table."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("sizes", nargs="*", type=int, default=[20, 60, 200], metavar="SIZE", help="vertices a side")
+    parser.add_argument("--device", default="cpu", help="Warp device (default: cpu)")
+    arguments = parser.parse_args()
+    device = arguments.device
     wp.config.log_level = wp.LOG_WARNING
     print("kind | vertices | crossings | certified | strain | largest, mean move | time")
-    for size in map(int, sys.argv[1:] or (20, 60, 200)):
+    for size in arguments.sizes:
         for kind, make in KINDS.items():
             faces, x = make(size)
-            mesh = bsc.CollisionMesh(faces, len(x), device="cpu")
+            mesh = bsc.CollisionMesh(faces, len(x), device=device)
             edge = np.median(np.linalg.norm(x[mesh.edges[:, 0]] - x[mesh.edges[:, 1]], axis=1))
-            bsc.repair(*make(20), device="cpu")  # loads kernels
+            bsc.repair(*make(20), device=device)  # loads kernels
             start = time.perf_counter()
-            result = bsc.repair(faces, x, device="cpu")
+            result = bsc.repair(faces, x, device=device)
             seconds = time.perf_counter() - start
             left = len(bsc.CollisionDetector(mesh).find_intersections(result.x))
             if result.certified and left:
