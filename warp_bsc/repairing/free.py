@@ -9,7 +9,7 @@ from .approach import approach, score_of
 from .elastic import Springs, near
 from .motion import Faults, push_apart
 from .sheets import separate_sheets
-from .surface import Surface, differ
+from .surface import Surface, differ, sums
 from .tetrahedra import follow_surface
 from .untangle import untangle
 
@@ -117,18 +117,18 @@ def free(
         movable: Vertices that may move, bool, shape [n], beside those near contours and near pairs.
     """
     x, springs = _opened(surface, start, crossings, movable)
-    left = _pieces_that_cross(surface, x, connect_cells(surface.edges, len(x)))
+    left = _pieces_that_cross(surface, x)
     if not len(left):
         return _returned(surface, x, springs, max_strain)
     is_of_two = (left[:, 0] != left[:, 1]).all()  # pieces that an order may free
     return _returned(surface, x, springs, max_strain, rounds=_ROUNDS_OF_ORDER if is_of_two else _ROUNDS_CROSSING)
 
 
-def _pieces_that_cross(surface: Surface, x: np.ndarray, piece: np.ndarray) -> np.ndarray:
-    """Returns the pieces of edges and faces that cross and are not fixed, given that of each vertex, shape [m, 2]."""
+def _pieces_that_cross(surface: Surface, x: np.ndarray) -> np.ndarray:
+    """Returns the pieces of edges and faces that cross and are not fixed, shape [m, 2]."""
     left = surface.crossings(x)
     left = left[~surface.are_fixed(left)]
-    return np.stack([piece[surface.mesh.edges[left[:, 0], 0]], piece[surface.mesh.faces[left[:, 1], 0]]], axis=1)
+    return surface.piece[np.stack([surface.mesh.edges[left[:, 0], 0], surface.mesh.faces[left[:, 1], 0]], axis=1)]
 
 
 def _opened(
@@ -137,8 +137,7 @@ def _opened(
     """Returns positions at which less crosses, or is near, and springs of what may move; as :func:`free` otherwise."""
     untangled, springs = untangle(surface, start, crossings)
     x = push_apart(surface, untangled) if surface.keeps_distance else untangled
-    (pushed,) = np.nonzero(differ(x, untangled))
-    may_move = springs.movable | near(surface, pushed, _RINGS)
+    may_move = springs.movable | near(surface, differ(x, untangled), _RINGS)
     if movable is not None:
         may_move |= movable
     return x, springs if (may_move == springs.movable).all() else Springs(surface, may_move)
@@ -161,14 +160,14 @@ def offset(surface: Surface, crossings: np.ndarray) -> np.ndarray:
     """
     faces, x = surface.mesh.faces, surface.home
     a, b, c = (x[faces[:, k]] for k in range(3))
-    normals, areas = np.zeros_like(x), np.cross(b - a, c - a)
-    np.add.at(normals, faces.ravel(), np.repeat(areas, 3, axis=0))
+    areas = np.cross(b - a, c - a)
+    normals = sums(faces.ravel(), np.repeat(areas, 3, axis=0), len(x))
     size = np.bincount(faces.ravel(), np.repeat(np.linalg.norm(areas, axis=1), 3), len(x))
     lengths = np.linalg.norm(normals, axis=1)
     # at a crease, normals cancel each other
     normals *= (lengths > _FLATTEST * size)[:, None] / np.maximum(lengths, 1e-30)[:, None]
     moves = near(surface, np.append(surface.mesh.edges[crossings[:, 0]], surface.mesh.faces[crossings[:, 1]]), 1)
-    _, piece = np.unique(connect_cells(surface.edges, len(x))[moves], return_inverse=True)
+    _, piece = np.unique(surface.piece[moves], return_inverse=True)
     distances = np.zeros((len(x), 1))
     distances[moves, 0] = _OFFSET * surface.edge * (1.0 + piece.reshape(-1)) / (1.0 + piece.max(initial=0))
     for side in (1.0, -1.0):
@@ -189,8 +188,8 @@ def free_by_smoothing(surface: Surface, start: np.ndarray, max_strain: float) ->
         start: Where the search begins, in units, shape [n, 3].
         max_strain: Largest strain that is sought.
     """
-    edges, piece = surface.edges, connect_cells(surface.edges, len(start))
-    first, second = _pieces_that_cross(surface, start, piece).T
+    edges, piece = surface.edges, surface.piece
+    first, second = _pieces_that_cross(surface, start).T
     crossing = first[first == second]
     if not len(crossing):
         return start
@@ -198,7 +197,7 @@ def free_by_smoothing(surface: Surface, start: np.ndarray, max_strain: float) ->
     sizes = np.bincount(piece, minlength=len(x))[:, None]
 
     def means(values, rows):
-        return np.stack([np.bincount(rows, v, len(x)) for v in values.T], axis=1) / np.maximum(sizes, 1)
+        return sums(rows, values, len(x)) / np.maximum(sizes, 1)
 
     def lengths(x):
         return means(np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1)[:, None], piece[edges[:, 0]])
@@ -230,9 +229,9 @@ def free_by_order(
         chosen: Sheet of each vertex from inside to outside, -1 for none, int, shape [n]; those that are chosen are
             written.
     """
-    piece, tried = connect_cells(surface.edges, len(x)), set()
+    piece, tried = surface.piece, set()
     while True:
-        ends = _pieces_that_cross(surface, x, piece)
+        ends = _pieces_that_cross(surface, x)
         pairs = sorted(set(map(tuple, np.sort(ends[ends[:, 0] != ends[:, 1]], axis=1).tolist())) - tried)
         if not pairs or surface.is_late:
             return x

@@ -63,7 +63,8 @@ def move_freely(
 ) -> tuple[np.ndarray, Contacts]:
     """Returns positions on the way to a goal that are reached without a collision, and the contacts on the way.
 
-    At first contacts are projected: they slide, and leave a gap. Later each vertex stops before its first contact.
+    At first contacts are projected: they slide, and leave a gap. Later each vertex stops before its first contact. If
+    that ends nowhere, contacts slide as long as they get fewer, and all vertices stop before the first one.
     Pairs that keep the minimum distance at the start keep it.
 
     Args:
@@ -72,24 +73,25 @@ def move_freely(
         goal: Likewise, as rounded to the type of the input.
         slides: Whether contacts slide at first.
     """
-    known = [Contacts.none()]
     near = near_pairs(surface, start)
-    for detection in range(_DETECTIONS):
-        contacts = _contacts(surface, start, goal, near)
-        if not len(contacts.toi):
-            return goal, Contacts.joined(known)
-        known.append(contacts)
-        if slides and detection < _PROJECTIONS:
-            goal = pushed(surface, goal, Contacts.joined(known))
-        else:
-            kept = np.ones(len(start))
-            np.minimum.at(kept, contacts.vertices.ravel(), np.repeat(_KEPT_TIME * contacts.toi, 4))
-            kept[kept < _LEAST_TIME] = 0.0
-            kept = surface.rigid.least(kept)
-            goal = start + kept[:, None] * (goal - start)
-        if surface.is_late:
-            break
-        goal = surface.rounded(goal)
+    for together in (False, True)[: 1 + slides]:
+        x, known, count = goal, [Contacts.none()], 0
+        for detection in range(_DETECTIONS):
+            before, contacts = count, _contacts(surface, start, x, near)
+            count = len(contacts.toi)
+            if not count:
+                return x, Contacts.joined(known)
+            known.append(contacts)
+            if slides and (detection < _PROJECTIONS or (together and count < before)):
+                x = pushed(surface, x, Contacts.joined(known))
+            else:
+                kept = np.ones(len(start))
+                np.minimum.at(kept, contacts.vertices.ravel(), np.repeat(_KEPT_TIME * contacts.toi, 4))
+                kept = surface.rigid.least(np.where(kept < _LEAST_TIME, 0.0, kept))
+                x = start + (kept.min() if together else kept[:, None]) * (x - start)
+            if surface.is_late:
+                break
+            x = surface.rounded(x)
     return start, Contacts.joined(known)
 
 

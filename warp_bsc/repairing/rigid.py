@@ -33,8 +33,6 @@ class RigidGroups:
             home: The input, shape [n, 3].
             rounding: Rounding error of each coordinate of vertices of groups, shape [m, 3].
         """
-        if not self._count:
-            return x
         fitted = self._fitted(x, home, np.ones(len(self.vertices)))
         off, allowed = np.zeros(self._count), np.zeros(self._count)
         np.maximum.at(off, self._group, np.abs(fitted - x[self.vertices]).max(axis=1))
@@ -49,8 +47,6 @@ class RigidGroups:
             home: The input, shape [n, 3].
             pushed: Vertices that are pushed, bool, shape [n].
         """
-        if not self._count:
-            return x
         leads = pushed[self.vertices]
         share = np.bincount(self._group, leads, self._count) / np.bincount(self._group)
         weights = np.where(leads, 1.0, _SLIGHT * share[self._group])

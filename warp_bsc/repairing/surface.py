@@ -80,6 +80,11 @@ def welded(mesh: CollisionMesh, weld: np.ndarray, radius: np.ndarray | None = No
     return changed_mesh(mesh, **changes, radius=radius, only_free=False)
 
 
+def sums(rows: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
+    """Returns the sums of the values, shape [n, k], of each row, in their order, shape [count, k]."""
+    return np.stack([np.bincount(rows, column, count) for column in values.T], axis=1)
+
+
 def differ(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Returns which rows of two arrays of vectors differ, bool, shape [n]."""
     differs = a != b
@@ -182,6 +187,11 @@ class Surface:
     def device_edges(self) -> wp.array:
         """Vertices of the edges on the device, shape [m, 2]."""
         return self.mesh.device_edges if self.edges is self.mesh.edges else self.array(self.edges, int)
+
+    @functools.cached_property
+    def piece(self) -> np.ndarray:
+        """The first vertex of those that edges connect with each one, int, shape [n]."""
+        return connect_cells(self.edges, len(self.home))
 
     @functools.cached_property
     def distance_detector(self) -> CollisionDetector:

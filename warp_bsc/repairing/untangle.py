@@ -14,7 +14,7 @@ from ..detection.run.launch import launch
 from .contours import trace_contours
 from .elastic import Springs, near, within
 from .kernels import contour_gradients
-from .surface import Surface
+from .surface import Surface, sums
 
 _STEP = 0.25
 """Distance by which an edge and a face move apart in an iteration, in edges."""
@@ -85,7 +85,7 @@ def _contour_moves(
     if whole:
         contours = trace_contours(mesh, crossings)
         sign = np.where(contours.sign < 0, -1.0, 1.0)[:, None]
-        mean = _sums(contours.number, sign * direction, len(contours.kinds))
+        mean = sums(contours.number, sign * direction, len(contours.kinds))
         direction = sign * (mean / np.maximum(np.linalg.norm(mean, axis=1), 1e-30)[:, None])[contours.number]
     # small elements take small steps, or their strain would be large
     sides = np.linalg.norm(x[corners] - x[np.roll(corners, 1, axis=1)], axis=2).mean(axis=1)
@@ -96,13 +96,10 @@ def _contour_moves(
     # edge and face share the step, unless one of them is fixed
     shares = np.where(weights[:, :2].any(axis=1) & weights[:, 2:].any(axis=1), 0.5, 1.0)[:, None]
     moves = (np.array([1.0, 1.0, -1.0, -1.0, -1.0]) * weights * shares)[:, :, None] * step[:, None, :]
-    involved, rows = np.unique(vertices, return_inverse=True)
-    rows = rows.reshape(-1)
-    total = _sums(rows, moves.reshape(-1, 3), len(involved))
-    weight = np.bincount(rows, weights.ravel(), len(involved))
-    moves, given = np.zeros_like(x), np.zeros(len(x), dtype=bool)
-    moves[involved] = total / np.maximum(weight, 0.5)[:, None]
-    given[involved] = ~surface.fixed[involved]
+    rows, count = vertices.ravel(), len(x)
+    weight = np.maximum(np.bincount(rows, weights.ravel(), count), 0.5)[:, None]
+    moves = sums(rows, moves.reshape(-1, 3), count) / weight
+    given = (np.bincount(rows, minlength=count) > 0) & ~surface.fixed
     bound = surface.rigid.vertices
     moves[bound] = (surface.rigid.carried(x + moves, surface.home, given) - x)[bound]
     given[bound] = moves[bound].any(axis=1)
@@ -148,8 +145,3 @@ def _gradients(surface: Surface, x: np.ndarray, crossings: np.ndarray) -> tuple[
         device=surface.device,
     )
     return along.numpy(), coordinates.numpy(), gradient.numpy()
-
-
-def _sums(rows: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
-    """Returns the sums of the vectors of each row, in the order of the vectors, shape [count, 3]."""
-    return np.stack([np.bincount(rows, values[:, axis], count) for axis in range(3)], axis=1)
