@@ -13,7 +13,7 @@ def two_sheets(n):
     """Returns the faces and positions of two sheets of n by n vertices, a third of an edge apart."""
     x, faces = grid(n - 1, np.float64)
     x /= x.max()
-    return np.concatenate([faces, faces + n * n]), np.concatenate([x, x + (0.0, 0.0, 0.3 / n)])
+    return np.concatenate([faces, faces + n * n]), np.concatenate([x, x + np.array([0.0, 0.0, 0.3 / n])])
 
 
 @pytest.mark.parametrize(("waves", "height"), [(6.75, 0.17), (6.7, 0.175)])
