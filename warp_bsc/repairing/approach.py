@@ -10,6 +10,9 @@ from .surface import Surface
 _ROUNDS = 60
 _LEAP = 4.0
 """Largest way of a round towards the input, in edges: from far, all springs relax after each."""
+_FAR = 32.0
+"""Way to the input, in edges, on which no vertex stays behind those around it: springs would not bring it back in time.
+"""
 _MOMENTUM, _MOMENTUM_FAR = 0.8, 0.9
 _SWEEPS, _MORE_SWEEPS = 40, 160
 """Sweeps of a round in which strains are below the limit at its start, and above it; as many more after each round
@@ -67,7 +70,7 @@ def approach(surface: Surface, x: np.ndarray, springs: Springs, max_strain: floa
         goal = surface.rounded(goal)
         if _are_near(x, goal, surface.edge):
             break
-        start, (x, contacts) = x, move_freely(surface, x, goal)
+        start, (x, contacts) = x, move_freely(surface, x, goal, together=farthest > _FAR * surface.edge)
         if is_relaxed and not is_far and not _are_near(x, goal, surface.edge):
             # what one contact has stopped early is strained, and goes on beside the others
             x, more = move_freely(surface, x, goal)

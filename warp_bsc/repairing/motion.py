@@ -59,12 +59,12 @@ class Faults:
 
 
 def move_freely(
-    surface: Surface, start: np.ndarray, goal: np.ndarray, *, slides: bool = True
+    surface: Surface, start: np.ndarray, goal: np.ndarray, *, slides: bool = True, together: bool = False
 ) -> tuple[np.ndarray, Contacts]:
     """Returns positions on the way to a goal that are reached without a collision, and the contacts on the way.
 
     At first contacts are projected: they slide, and leave a gap. Later each vertex stops before its first contact. If
-    that ends nowhere, contacts slide as long as they get fewer, and all vertices stop before the first one.
+    that ends nowhere, or is not asked for, contacts slide as long as they get fewer, and all vertices stop together.
     Pairs that keep the minimum distance at the start keep it.
 
     Args:
@@ -72,9 +72,10 @@ def move_freely(
         start: Positions, in units, shape [n, 3].
         goal: Likewise, as rounded to the type of the input.
         slides: Whether contacts slide at first.
+        together: Whether all vertices stop together from the first.
     """
     near = near_pairs(surface, start)
-    for together in (False, True)[: 1 + slides]:
+    for are_joint in [True] if together else [False, True][: 1 + slides]:
         x, known, count = goal, [Contacts.none()], 0
         for detection in range(_DETECTIONS):
             before, contacts = count, _contacts(surface, start, x, near)
@@ -82,13 +83,13 @@ def move_freely(
             if not count:
                 return x, Contacts.joined(known)
             known.append(contacts)
-            if slides and (detection < _PROJECTIONS or (together and count < before)):
+            if slides and (detection < _PROJECTIONS or (are_joint and count < before)):
                 x = pushed(surface, x, Contacts.joined(known))
             else:
                 kept = np.ones(len(start))
                 np.minimum.at(kept, contacts.vertices.ravel(), np.repeat(_KEPT_TIME * contacts.toi, 4))
                 kept = surface.rigid.least(np.where(kept < _LEAST_TIME, 0.0, kept))
-                x = start + (kept.min() if together else kept[:, None]) * (x - start)
+                x = start + (kept.min() if are_joint else kept[:, None]) * (x - start)
             if surface.is_late:
                 break
             x = surface.rounded(x)
