@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from .._sorted_keys import search
+from .._sorted_keys import KeySet
 from ..detection.arcs.rigid_motion import RigidMotion
 from ..detection.detector import Collisions
 from ..detection.mesh import CollisionMesh
@@ -175,8 +175,10 @@ def compare_contacts(
     """
     segment, counts = contacts[0].segment, [len(one) for one in contacts]
     separate, phase = np.zeros(sum(counts), dtype=bool), np.full(sum(counts), -1)
-    joined = {name: np.concatenate([getattr(one, name) for one in contacts]) for name in ScenePairs.BY_PAIR}
-    pairs = ScenePairs(segment, **joined)
+    pairs = contacts[0]
+    if len(contacts) > 1:
+        joined = {name: np.concatenate([getattr(one, name) for one in contacts]) for name in ScenePairs.BY_PAIR}
+        pairs = ScenePairs(segment, **joined)
     (rows,) = np.nonzero(_may_cross(pairs)) if len(pairs) else (np.zeros(0, dtype=np.int64),)
     if len(rows):
         times = list({id(found): found for both in at_rest for found in both}.values())
@@ -184,17 +186,19 @@ def compare_contacts(
         starts, ends = np.repeat([[number_of[id(found)] for found in both] for both in at_rest], counts, axis=0)[rows].T
         shift = len(segment.meshes) ** 2
         crossing = np.concatenate([found.mesh_keys() + number * shift for number, found in enumerate(times)])
-        separate[rows] = ~np.isin(pairs.mesh_keys()[rows] + starts * shift, crossing)
+        separate[rows] = ~KeySet(crossing).has(pairs.mesh_keys()[rows] + starts * shift)
         phase[rows] = 0
         firsts, others = pairs.vertices[rows, 0], pairs.vertices[rows, 1][:, [0, 1, 1]]
         seconds = np.where((pairs.kind[rows] == 0)[:, None], segment.faces[pairs.faces[rows, 1]], others)
         firsts = np.where(firsts < 0, firsts[:, :1], firsts)
-        keys, tangled = pair_keys(segment, firsts[:, :, None], seconds[:, None, :]), tangled_vertices(times)
-        if len(tangled):
-            for weight, numbers in ((2, starts), (1, ends)):
-                of_time = (keys + numbers[:, None, None] * segment.vertex_count**2).reshape(-1)
-                found = np.minimum(search(tangled, of_time), len(tangled) - 1)
-                phase[rows] += weight * (tangled[found] == of_time).reshape(-1, 6).any(axis=1)
+        tangled = KeySet(tangled_vertices(times))
+        for weight, numbers in ((2, starts), (1, ends)):
+            rest = np.arange(len(rows))  # those that no pair of vertices has shown yet to cross; one often suffices
+            for one, other in np.ndindex(2, 3):
+                keys = pair_keys(segment, firsts[rest, one], seconds[rest, other])
+                found = tangled.has(keys + numbers[rest] * segment.vertex_count**2)
+                phase[rows[rest[found]]] += weight
+                rest = rest[~found]
     parts = map(slice, np.cumsum([0, *counts]), np.cumsum(counts))
     return [replace(one, separate=separate[own], phase=phase[own]) for one, own in zip(contacts, parts, strict=False)]
 
