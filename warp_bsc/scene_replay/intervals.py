@@ -112,7 +112,7 @@ def _checked_validate(validate: Any) -> int | Literal["all"]:
 
 
 def _replay(
-    scene: Scene, checks: Checks, ignore_initial: bool, earlier: Iterable[IntervalResult], workers: int | str | LocalWorkers
+    scene: Scene, checks: Checks, ignore_initial: bool, earlier: Iterable[IntervalResult], workers: Any
 ) -> Iterator[IntervalResult]:
     """Yields the results of :func:`replay`, whose arguments have been checked."""
     with contextlib.ExitStack() as stack:

@@ -131,10 +131,9 @@ def find_contacts(
     named = name_elements(segment, vertices, faces, ends, (points, point_ends.astype(np.int64), both))
     arrays = {"toi": tois, "position": position, "normal": normal}
     arrays = named | {name: np.concatenate(parts) for name, parts in arrays.items()}
-    if len(mesh.free_edges) + len(mesh.points):
-        first, second = named["meshes"].T
-        stiff = (first == second) & np.array([part.moves and not part.deforms for part in segment.meshes])[first]
-    else:
+    first, second = named["meshes"].T
+    stiff = (first == second) & np.array([part.moves and not part.deforms for part in segment.meshes])[first]
+    if segment.welded and not len(mesh.free_edges) + len(mesh.points):  # elements may be of several meshes
         stiff = are_stiff_pairs(segment, vertices, named["meshes"][: len(vertices), 1], ends)
     parts = split_rows(arrays | {"stiff": stiff}, copies, len(intervals))
     return [_select(interval, part, selection) for interval, part in zip(intervals, parts, strict=True)]

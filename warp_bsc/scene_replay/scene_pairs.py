@@ -221,8 +221,6 @@ def split_rows(arrays: dict[str, np.ndarray], copies: np.ndarray, count: int) ->
 
 def are_stiff_pairs(segment: Segment, vertices: np.ndarray, face_meshes: np.ndarray, ends: np.ndarray) -> np.ndarray:
     """Returns whether each pair, as of :func:`name_elements`, is of one mesh that only its transform moves, bool."""
-    if not any(mesh.moves and not mesh.deforms for mesh in segment.meshes):
-        return np.zeros(len(vertices) + len(ends), dtype=bool)
     rows, meshes = segment.meshes_at_edges(ends[:, 1])
     of_edges = segment.are_stiff(ends[rows, 0], meshes)
     edges = np.zeros(len(ends), dtype=bool)

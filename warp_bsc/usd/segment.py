@@ -325,6 +325,8 @@ class Segment:
             Bool array of shape [n].
         """
         stiff = np.array([mesh.moves and not mesh.deforms for mesh in self.meshes], dtype=bool)
+        if not self.welded:
+            return stiff[meshes] & (self.locate_vertices(elements.reshape(len(elements), -1)[:, 0])[0] == meshes)
         are_stiff = np.zeros(len(elements), dtype=bool)
         if stiff.any():
             rows, own = self.meshes_at_vertices(elements) if elements.ndim == 1 else self.meshes_at_edges(elements)
