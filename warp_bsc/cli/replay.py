@@ -2,7 +2,6 @@
 
 import argparse
 import contextlib
-from typing import Any
 
 from .._atomic_file import STDOUT, unfinished_path
 from ..scene_replay.baseline import Baseline
@@ -23,7 +22,8 @@ def add_to(commands: Commands, summary: str) -> None:
 def _run(arguments: argparse.Namespace) -> int:
     with contextlib.ExitStack() as stack:
         scene = _open_scene(arguments, stack)
-        options = _describe_options(scene, arguments)
+        names = "subdivide", "intersections", "ignore_initial", "validate", "limit"  # what results depend on as well
+        options = describe_selection(scene, arguments) | {name: getattr(arguments, name) for name in names}
         baseline = None
         if arguments.baseline:
             settings = {"method": arguments.method, "clearance": arguments.clearance, "options": options}
@@ -87,9 +87,3 @@ def _open_scene(arguments: argparse.Namespace, stack: contextlib.ExitStack) -> S
         as_json=arguments.progress == "json",
         written=[file for file in written if file != STDOUT],
     )
-
-
-def _describe_options(scene: Scene, arguments: argparse.Namespace) -> dict[str, Any]:
-    """Returns the options that the results depend on, except method, device and clearance."""
-    names = "subdivide", "intersections", "ignore_initial", "validate", "limit"
-    return describe_selection(scene, arguments) | {name: getattr(arguments, name) for name in names}

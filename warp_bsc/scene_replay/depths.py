@@ -324,10 +324,8 @@ def _depth_behind(shape: _Shape, surface: _Surface, x: np.ndarray, crossings: _C
         distance[near], at_border[near] = surface.distances(places[near], reach)
         is_far = distance == np.inf
         sides = _find_sides(shape, crossings, at_border | is_far)
-        piece, side = (
-            np.where(at_border | is_far, -1, sides.piece[sides.region]),
-            sides.is_second[sides.region].astype(int),
-        )
+        piece = np.where(at_border | is_far, -1, sides.piece[sides.region])
+        side = sides.is_second[sides.region].astype(int)
         if piece.max() < 0:
             return _Depth(None, at_edges)
         largest = np.zeros((len(sides.piece) + 1, 2))

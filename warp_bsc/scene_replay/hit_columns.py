@@ -151,7 +151,7 @@ class HitsNpz(ReplayOutput):
 
     def _blocks(self, name: str, count: int) -> Iterator[bytearray]:
         """Yields the bytes of a column of some intervals, the header of NumPy's format first."""
-        dtype, offset = (_ROW.fields or {})[name][:2]
+        dtype, offset = cast(Any, _ROW.fields)[name]
         shape = (self._ends[count - 1] if count else 0, *dtype.shape)
         header = {"descr": np.lib.format.dtype_to_descr(dtype.base), "fortran_order": False, "shape": shape}
         np.lib.format.write_array_header_1_0(stream := io.BytesIO(), header)

@@ -17,17 +17,7 @@ from ..usd.interval import Interval, positions_of
 from ..usd.selection import Selection
 from .scene_arcs import positions_at
 from .scene_intersections import SceneIntersections, pair_keys, tangled_vertices
-from .scene_pairs import (
-    EDGE,
-    NO_PAIRS,
-    VERTEX,
-    ScenePairs,
-    are_stiff_pairs,
-    count_by_meshes,
-    name_elements,
-    split_rows,
-    take_rows,
-)
+from .scene_pairs import NO_PAIRS, VERTEX, ScenePairs, are_stiff, count_by_meshes, name_elements, split_rows, take_rows
 
 
 @dataclass(frozen=True)
@@ -63,7 +53,7 @@ class SceneContacts(ScenePairs):
     @cached_property
     def colliding_faces(self) -> np.ndarray:
         """Faces of the segment that collide or have an edge that collides, ascending."""
-        ends = self.vertices[self.elements >= EDGE]
+        ends = self.vertices[self.vertices[:, :, 1] >= 0]
         return np.union1d(self.faces[self.faces >= 0], self.segment.faces_at_edges(np.unique(ends, axis=0)))
 
     def colliding_polygons(self) -> dict[int, np.ndarray]:
@@ -134,7 +124,7 @@ def find_contacts(
     first, second = named["meshes"].T
     stiff = (first == second) & np.array([part.moves and not part.deforms for part in segment.meshes])[first]
     if segment.welded and not len(mesh.free_edges) + len(mesh.points):  # elements may be of several meshes
-        stiff = are_stiff_pairs(segment, vertices, named["meshes"][: len(vertices), 1], ends)
+        stiff = are_stiff(segment, vertices, named["meshes"][: len(vertices), 1], ends)
     parts = split_rows(arrays | {"stiff": stiff}, copies, len(intervals))
     return [_select(interval, part, selection) for interval, part in zip(intervals, parts, strict=True)]
 
