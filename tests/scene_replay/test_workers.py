@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import multiprocessing
 import os
 import pickle
 import re
@@ -159,6 +160,23 @@ def test_devices_that_are_not_there_or_too_many(waves, capsys):
         bsc.replay(bsc.Scene(waves), device="cpu,cpu", workers=1)
     with pytest.raises(ValueError, match="cuda:99: there is no such device here, only cpu"):
         list(bsc.replay(bsc.Scene(waves), device="cpu,cuda:99"))
+
+
+def test_workers_that_start_before_a_broken_scene_is_read_end(tmp_path, capsys, monkeypatch):
+    close, started = workers.LocalWorkers.close, []
+
+    def close_what_has_started(processes):
+        started.append(multiprocessing.active_children())
+        close(processes)
+
+    monkeypatch.setattr(workers.LocalWorkers, "close", close_what_has_started)
+    (tmp_path / "scene.usda").write_text("#usda 1.0\ndef")
+    assert main(["replay", str(tmp_path / "scene.usda"), "--device", "cpu", "--workers", "2"]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("warp-bsc: error: ") and said.count("\n") == 1 and "scene.usda" in said
+    for process in started.pop():
+        process.join(10.0)
+        assert process.exitcode == -signal.SIGKILL
 
 
 @pytest.mark.parametrize("intervals", [0, 1, 7, 50, 1000])

@@ -23,7 +23,7 @@ def replay(
     clearance: float | None = None,
     validate: int | Literal["all"] = 0,
     earlier: Iterable[IntervalResult] = (),
-    workers: int | str | LocalWorkers | None = None,
+    workers: int | str | None = None,
 ) -> Iterator[IntervalResult]:
     """Finds the collisions in every interval between two consecutive times of a scene, one interval at a time.
 
