@@ -15,8 +15,6 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-import warp as wp
-
 from .._version import __version__
 from ..detection.run.launch import cores
 from ..detection.run.start import device_names, find_device, gpu_count
@@ -149,10 +147,10 @@ def name_device(name: str | None) -> str:
 
 
 def prepare(devices: str | None) -> None:
-    """Imports what opens a scene, and starts the device that this worker uses."""
+    """Imports what opens a scene, and starts Warp, before the first chunk of this worker."""
     from ..usd.read import find_meshes  # noqa: F401, PLC0415 (imports pxr)
 
-    wp.synchronize_device(name_device(devices))
+    name_device(devices)
 
 
 def _open(job: bytes, first: int) -> _Opened:
