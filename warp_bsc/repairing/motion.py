@@ -63,8 +63,8 @@ def move_freely(
 ) -> tuple[np.ndarray, Contacts]:
     """Returns positions on the way to a goal that are reached without a collision, and the contacts on the way.
 
-    At first contacts are projected: they slide, and leave a gap. Later each vertex stops before its first contact. If
-    that ends nowhere, or is not asked for, contacts slide as long as they get fewer, and all vertices stop together.
+    At first contacts are projected: they slide, and leave a gap. Later each vertex stops before its first contact, or
+    contacts slide as long as they get fewer, and all vertices stop together: the second if the first ends nowhere.
     Pairs that keep the minimum distance at the start keep it.
 
     Args:
@@ -72,10 +72,10 @@ def move_freely(
         start: Positions, in units, shape [n, 3].
         goal: Likewise, as rounded to the type of the input.
         slides: Whether contacts slide at first.
-        together: Whether all vertices stop together from the first.
+        together: Whether that is tried first.
     """
     near = near_pairs(surface, start)
-    for are_joint in [True] if together else [False, True][: 1 + slides]:
+    for are_joint in (together, not together)[: 1 + slides]:
         x, known, count = goal, [Contacts.none()], 0
         for detection in range(_DETECTIONS):
             before, contacts = count, _contacts(surface, start, x, near)
@@ -90,7 +90,7 @@ def move_freely(
                 np.minimum.at(kept, contacts.vertices.ravel(), np.repeat(_KEPT_TIME * contacts.toi, 4))
                 kept = surface.rigid.least(np.where(kept < _LEAST_TIME, 0.0, kept))
                 x = start + (kept.min() if are_joint else kept[:, None]) * (x - start)
-            if surface.is_late:
+            if surface.is_late or (x == start).all():
                 break
             x = surface.rounded(x)
     return start, Contacts.joined(known)
