@@ -29,6 +29,30 @@ def search(keys: np.ndarray, values: np.ndarray) -> np.ndarray:
     return places
 
 
+class KeySet:
+    """A set of integers of at least 0: a table that has for each hash one key, and the others, ascending."""
+
+    def __init__(self, keys: np.ndarray):
+        """Makes it of keys, some of which may be equal."""
+        self._bits = (2 * len(keys) + 1).bit_length()
+        places = self._places(keys)
+        self._table = np.full(1 << self._bits, -1)
+        self._table[places] = keys
+        self._others = distinct(keys[self._table[places] != keys])
+
+    def has(self, values: np.ndarray) -> np.ndarray:
+        """Returns which values are in it, as :func:`numpy.isin` does, which sorts."""
+        keys = self._table[self._places(values)]
+        found = keys == values
+        rest = np.flatnonzero(~found & (keys >= 0))
+        found[rest] = np.isin(values[rest], self._others)
+        return found
+
+    def _places(self, keys: np.ndarray) -> np.ndarray:
+        hashes = keys.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+        return (hashes >> np.uint64(64 - self._bits)).view(np.int64)
+
+
 def search_ranges(keys: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns the first of the ascending keys that equals each value, and the one after the last."""
     if len(values) < _FEW:

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import zipfile
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from replay_files import falling_through_quads, many_hits, near_and_inside_stage
 from usd_stages import save
 
 from warp_bsc.cli.main import main
+from warp_bsc.scene_replay import hit_columns
 
 
 def rows_of_csv(path):
@@ -60,6 +62,19 @@ def test_a_hit_takes_less_than_30_bytes(tmp_path):
     sizes = {name: (tmp_path / f"hits.{name}").stat().st_size for name in ("json", "npz")}
     assert len(columns["kind"]) > 5000 and words < 100
     assert sizes["npz"] < 30 * len(columns["kind"]) < sizes["json"] / 5
+
+
+def test_blocks_of_any_size_hold_the_same_columns(tmp_path, monkeypatch):
+    """Other programs read the archive as well: sizes and checksums of all members are those of their content."""
+    scene, found = many_hits(tmp_path / "scene.usda", columns=20, samples=5), []
+    for size, count in ((2**20, 32), (100, 3)):
+        monkeypatch.setattr(hit_columns, "_BLOCK", size)
+        monkeypatch.setattr(hit_columns, "_BLOCKS_AT_ONCE", count)
+        replay(scene)
+        with zipfile.ZipFile(tmp_path / "hits.npz") as archive:
+            assert archive.testzip() is None
+            found.append({name: archive.read(name) for name in archive.namelist()})
+    assert found[0] == found[1] and len(found[0]["position.npy"]) > 1000
 
 
 def test_columns_are_not_printed(tmp_path, capsys):

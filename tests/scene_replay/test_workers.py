@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import multiprocessing
 import os
 import pickle
 import re
@@ -161,16 +162,36 @@ def test_devices_that_are_not_there_or_too_many(waves, capsys):
         list(bsc.replay(bsc.Scene(waves), device="cpu,cuda:99"))
 
 
+def test_workers_that_start_before_a_broken_scene_is_read_end(tmp_path, capsys, monkeypatch):
+    close, started = workers.LocalWorkers.close, []
+
+    def close_what_has_started(processes):
+        started.append(multiprocessing.active_children())
+        close(processes)
+
+    monkeypatch.setattr(workers.LocalWorkers, "close", close_what_has_started)
+    (tmp_path / "scene.usda").write_text("#usda 1.0\ndef")
+    assert main(["replay", str(tmp_path / "scene.usda"), "--device", "cpu", "--workers", "2"]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("warp-bsc: error: ") and said.count("\n") == 1 and "scene.usda" in said
+    for process in started.pop():
+        process.join(10.0)
+        assert process.exitcode == -signal.SIGKILL
+
+
 @pytest.mark.parametrize("intervals", [0, 1, 7, 50, 1000])
 def test_chunks_are_of_equal_length(waves, monkeypatch, intervals):
-    """All workers then end at about the same time; 50 intervals on 4 GPUs are 16 chunks of 3 or 4."""
+    """All workers then end at about the same time; 50 intervals on 4 GPUs are 12 chunks of 4 or 5, 7 are 4 of 1 or 2.
+
+    The first time of a chunk is checked in the chunk before as well, which takes as long as an interval.
+    """
     scene = bsc.Scene(waves)
     monkeypatch.setattr(bsc.Scene, "__len__", lambda _: intervals + 3)
     chunks = list(workers.cut_in_chunks(scene, 3, 4))
     assert [number for chunk in chunks for number in range(*chunk)] == list(range(3, intervals + 3))
     lengths = {stop - start for start, stop in chunks}
     assert max(lengths, default=0) - min(lengths, default=0) <= 1 and max(lengths, default=1) <= 16
-    assert len(chunks) == {50: 16}.get(intervals, len(chunks))
+    assert len(chunks) == {7: 4, 50: 12}.get(intervals, len(chunks))
 
 
 @pytest.mark.parametrize("options", [(), ("--ignore-initial", "--ignore", "/World/A", "*", "--clearance", "0.02")])

@@ -1,11 +1,11 @@
 """The command ``warp-bsc replay``: finds the collisions in a USD scene and writes them to tables and files."""
 
 import argparse
-from typing import Any
+import contextlib
 
 from .._atomic_file import STDOUT, unfinished_path
 from ..scene_replay.baseline import Baseline
-from ..scene_replay.workers import checked_workers, device_of_cluster
+from ..scene_replay.workers import LocalWorkers, checked_workers, device_of_cluster
 from ..usd.scene import Scene
 from .device import find_devices, load_detector, loading_kernels
 from .options import Commands, add_command, scene_path
@@ -20,28 +20,28 @@ def add_to(commands: Commands, summary: str) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    scene = _open_scene(arguments)
-    options = _describe_options(scene, arguments)
-    baseline = None
-    if arguments.baseline:
-        settings = {"method": arguments.method, "clearance": arguments.clearance, "options": options}
-        baseline = Baseline(arguments.baseline, **settings)
-    if isinstance(arguments.workers, str):
-        name = device_of_cluster(arguments.workers, arguments.device)
-    else:
-        devices = find_devices(arguments.device)
-        checked_workers(arguments.workers, arguments.device)
-        also = {"intersections": arguments.intersections, "proximities": arguments.clearance is not None}
-        for device in {device.arch: device for device in devices}.values():  # for which kernels are compiled
-            with loading_kernels(device):
-                load_detector(arguments.method, scene.dtype, device, **also, strands=scene.has_strands)
-        name = ",".join(dict.fromkeys(map(str, devices)))
-    with ReplayRun(scene, arguments, name, options, baseline) as run:
-        return run.run()
+    with contextlib.ExitStack() as stack:
+        scene = _open_scene(arguments, stack)
+        names = "subdivide", "intersections", "ignore_initial", "validate", "limit"  # what results depend on as well
+        options = describe_selection(scene, arguments) | {name: getattr(arguments, name) for name in names}
+        baseline = None
+        if arguments.baseline:
+            settings = {"method": arguments.method, "clearance": arguments.clearance, "options": options}
+            baseline = Baseline(arguments.baseline, **settings)
+        if isinstance(arguments.workers, str):
+            name = device_of_cluster(arguments.workers, arguments.device)
+        else:
+            devices = find_devices(arguments.device)
+            also = {"intersections": arguments.intersections, "proximities": arguments.clearance is not None}
+            for device in {device.arch: device for device in devices}.values():  # for which kernels are compiled
+                with loading_kernels(device):
+                    load_detector(arguments.method, scene.dtype, device, **also, strands=scene.has_strands)
+            name = ",".join(dict.fromkeys(map(str, devices)))
+        return stack.enter_context(ReplayRun(scene, arguments, name, options, baseline)).run()
 
 
-def _open_scene(arguments: argparse.Namespace) -> Scene:
-    """Opens the scene that the options name.
+def _open_scene(arguments: argparse.Namespace, stack: contextlib.ExitStack) -> Scene:
+    """Opens the scene that the options name; meanwhile the processes that check it start, which the stack ends.
 
     Raises:
         FileNotFoundError: If there is no such file.
@@ -73,6 +73,10 @@ def _open_scene(arguments: argparse.Namespace) -> Scene:
         raise ValueError("--npz: it is no text, name a file")
     if outputs.count(STDOUT) > 1:
         raise ValueError("--json, --csv and --report: only one of them can be printed on standard output")
+    workers = checked_workers(arguments.workers, arguments.device)
+    if isinstance(workers, int) and workers > 1:
+        arguments.workers = stack.enter_context(contextlib.closing(LocalWorkers(workers)))
+        arguments.workers.start(arguments.device)
     written = [*outputs, str(unfinished_path(arguments.json))] if is_saved else outputs
     return read_scene(
         arguments.scene,
@@ -83,9 +87,3 @@ def _open_scene(arguments: argparse.Namespace) -> Scene:
         as_json=arguments.progress == "json",
         written=[file for file in written if file != STDOUT],
     )
-
-
-def _describe_options(scene: Scene, arguments: argparse.Namespace) -> dict[str, Any]:
-    """Returns the options that the results depend on, except method, device and clearance."""
-    names = "subdivide", "intersections", "ignore_initial", "validate", "limit"
-    return describe_selection(scene, arguments) | {name: getattr(arguments, name) for name in names}

@@ -23,7 +23,7 @@ from .results import IntervalResult
 from .scene_intersections import SceneIntersections
 
 _ON_SIDE = 1e-5  # barycentric coordinate up to which the closest point of a face is on a side of it
-_FIRST_REACH = 0.02  # part of the size of a mesh or a surface up to which vertices are searched first
+_FIRST_REACH = 0.005  # part of the size of a mesh or a surface up to which vertices are searched first
 _MOST_WORK, _MOST_AT_ONCE, _OF_A_PAIR = 1_000_000, 4_000_000, 1_000
 """Number of vertices whose distances are measured, over all times and at one, and as many as two meshes count for."""
 _GROWTH = 0.1
@@ -318,16 +318,14 @@ def _depth_behind(shape: _Shape, surface: _Surface, x: np.ndarray, crossings: _C
     low, high = _box(places)
     size = max(surface.size, float(np.linalg.norm(high - low)))
     reach = max(2.0 * float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).max()), _FIRST_REACH * size)
+    distance, at_border = np.full(len(places), np.inf), np.zeros(len(places), dtype=bool)
     while True:
-        distance, at_border = np.full(len(places), np.inf), np.zeros(len(places), dtype=bool)
-        near = np.flatnonzero(of_parts & surface.may_be_near(places, reach))
+        near = np.flatnonzero(of_parts & (distance == np.inf) & surface.may_be_near(places, reach))
         distance[near], at_border[near] = surface.distances(places[near], reach)
         is_far = distance == np.inf
         sides = _find_sides(shape, crossings, at_border | is_far)
-        piece, side = (
-            np.where(at_border | is_far, -1, sides.piece[sides.region]),
-            sides.is_second[sides.region].astype(int),
-        )
+        piece = np.where(at_border | is_far, -1, sides.piece[sides.region])
+        side = sides.is_second[sides.region].astype(int)
         if piece.max() < 0:
             return _Depth(None, at_edges)
         largest = np.zeros((len(sides.piece) + 1, 2))

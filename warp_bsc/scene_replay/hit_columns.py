@@ -1,10 +1,16 @@
 """Writes every collision, intersection and proximity of a replay as columns, in the compressed format of NumPy."""
 
+import io
 import json
 import os
+import struct
 import tempfile
 import zipfile
+import zlib
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
+from itertools import islice, pairwise
 from typing import Any, cast
 
 import numpy as np
@@ -36,7 +42,8 @@ _ROW = np.dtype(
     ]
 )
 """What is kept of a pair; its fields are the columns."""
-_ROWS_AT_ONCE = 2**16
+_BLOCK, _BLOCKS_AT_ONCE = 2**20, 32  # bytes that a thread deflates, and number of blocks in memory
+_LEVEL = 4  # 2% more bytes than at zlib's default, in 0.6 of its time
 
 
 class HitsNpz(ReplayOutput):
@@ -54,7 +61,7 @@ class HitsNpz(ReplayOutput):
 
     Times of impact, positions and distances are in single precision. Pairs at rest, intersections and proximities, are
     at ``toi`` 0, in the last interval some at 1. The whole is on disk until the file is finished, so that memory does
-    not grow with it.
+    not grow with it: the columns of an interval one after the other, then those of the next.
     """
 
     def __init__(self, path: str | os.PathLike, *, facts: dict[str, Any], interval_count: int):
@@ -83,15 +90,13 @@ class HitsNpz(ReplayOutput):
         rows["interval"] = len(self._ends)
         before = self._ends[-1] if self._ends else 0
         self._rows.seek(before * _ROW.itemsize)
-        self._rows.write(rows.tobytes())
+        self._rows.write(b"".join(rows[name].tobytes() for name in _ROW.names or ()))
         self._ends.append(before + len(rows))
         self._times.append((interval.start, interval.end))
 
     def finish(self, summary: Summary) -> None:
         """Compresses the columns, and moves the file to its path."""
         count = min(len(summary.intervals), len(self._ends))  # the last interval may be missing
-        rows = self._ends[count - 1] if count else 0
-        self._rows.flush()
         self.file.truncate(0)
         part = summary.first(count)
         facts = self._facts | {"complete": part.is_complete, "stopped": part.stopped, "hits": part.hits}
@@ -106,9 +111,9 @@ class HitsNpz(ReplayOutput):
             for name, value in values.items():
                 with archive.open(f"{name}.npy", "w") as member:
                     np.lib.format.write_array(member, np.asarray(value), allow_pickle=False)
-            for name in _ROW.names or ():
-                with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                    self._write_column(member, name, rows)
+            with ThreadPoolExecutor(os.cpu_count()) as pool:
+                for name in _ROW.names or ():
+                    self._write_column(archive, pool, name, count)
         self.file.commit()
         self._rows.close()
 
@@ -127,15 +132,37 @@ class HitsNpz(ReplayOutput):
         self._rows.close()
         super().discard()
 
-    def _write_column(self, member, name: str, rows: int) -> None:
-        """Writes a column to the archive, some rows after the other."""
-        dtype, shape = _ROW[name].base, (rows, *_ROW[name].shape)
-        header = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
-        np.lib.format.write_array_header_1_0(member, header)
-        self._rows.seek(0)
-        for first in range(0, rows, _ROWS_AT_ONCE):
-            size = min(_ROWS_AT_ONCE, rows - first) * _ROW.itemsize
-            member.write(np.ascontiguousarray(np.frombuffer(self._rows.read(size), _ROW)[name]).tobytes())
+    def _write_column(self, archive: zipfile.ZipFile, pool: ThreadPoolExecutor, name: str, count: int) -> None:
+        """Writes a column of some intervals to the archive, as zipfile would, but deflated in blocks by threads."""
+        info = zipfile.ZipInfo(f"{name}.npy")
+        info.compress_type, info.flag_bits, info.header_offset = zipfile.ZIP_DEFLATED, 0x08, self.file.tell()
+        self.file.write(info.FileHeader(zip64=True))
+        start, blocks, info.CRC = self.file.tell(), self._blocks(name, count), 0
+        while some := list(islice(blocks, _BLOCKS_AT_ONCE)):
+            for block, deflated in zip(some, pool.map(_deflate, some), strict=True):
+                self.file.write(deflated)
+                info.CRC, info.file_size = zlib.crc32(block, info.CRC), info.file_size + len(block)
+        self.file.write(zlib.compressobj(wbits=-15).flush())  # the end of the stream
+        info.compress_size = self.file.tell() - start
+        # the sizes follow the data, as flag 0x08 says
+        self.file.write(b"PK\x07\x08" + struct.pack("<LQQ", info.CRC, info.compress_size, info.file_size))
+        archive.filelist.append(info)
+        archive.start_dir = self.file.tell()
+
+    def _blocks(self, name: str, count: int) -> Iterator[bytearray]:
+        """Yields the bytes of a column of some intervals, the header of NumPy's format first."""
+        dtype, offset = cast(Any, _ROW.fields)[name]
+        shape = (self._ends[count - 1] if count else 0, *dtype.shape)
+        header = {"descr": np.lib.format.dtype_to_descr(dtype.base), "fortran_order": False, "shape": shape}
+        np.lib.format.write_array_header_1_0(stream := io.BytesIO(), header)
+        block = bytearray(stream.getvalue())
+        for first, last in pairwise([0, *self._ends[:count]]):
+            self._rows.seek(first * _ROW.itemsize + (last - first) * offset)
+            block += self._rows.read((last - first) * dtype.itemsize)
+            if len(block) >= _BLOCK:
+                yield block
+                block = bytearray()
+        yield block
 
     def _rows_of(self, pairs: AnyPairs, start: float) -> np.ndarray:
         """Returns the rows of pairs of an interval that starts at a time."""
@@ -159,3 +186,9 @@ class HitsNpz(ReplayOutput):
             part = segment.meshes[mesh]
             number[mesh] = self._meshes.setdefault((part.name, part.path), len(self._meshes))
         return number[meshes]
+
+
+def _deflate(block: bytearray) -> bytes:
+    """Returns a part of a stream of zlib's that needs none of the parts before."""
+    deflater = zlib.compressobj(_LEVEL, wbits=-15)
+    return deflater.compress(block) + deflater.flush(zlib.Z_FULL_FLUSH)

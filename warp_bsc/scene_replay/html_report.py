@@ -218,10 +218,8 @@ class ReportPage(RecordFile):
         for name, listed, shown in zip(names, found, zip(*rows, strict=True), strict=True):
             if sum(shown) < listed:
                 notes.append(f"The table has {sum(shown):,} of {listed:,} {name}: {most}. JSON and CSV files have all.")
-        if self._views.partial_strands:
-            notes.append(
-                f"{self._views.partial_strands:,} views in 3D have only some of the curves or points, spread evenly."
-            )
+        if partial := self._views.partial_strands:
+            notes.append(f"{partial:,} views in 3D have only some of the curves or points, spread evenly.")
         if self._views.without_view:
             notes.append(f"{self._views.without_view:,} intervals have no view in 3D, as the page is full.")
         spans = [*summary.collision_spans, *summary.intersection_spans, *summary.proximity_spans]

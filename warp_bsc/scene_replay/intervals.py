@@ -112,13 +112,14 @@ def _checked_validate(validate: Any) -> int | Literal["all"]:
 
 
 def _replay(
-    scene: Scene, checks: Checks, ignore_initial: bool, earlier: Iterable[IntervalResult], workers: int | str
+    scene: Scene, checks: Checks, ignore_initial: bool, earlier: Iterable[IntervalResult], workers: Any
 ) -> Iterator[IntervalResult]:
     """Yields the results of :func:`replay`, whose arguments have been checked."""
     with contextlib.ExitStack() as stack:
         processes = None
         if workers != 1:
-            processes = Cluster(workers) if isinstance(workers, str) else LocalWorkers(workers)
+            processes = LocalWorkers(workers) if isinstance(workers, int) else workers
+            processes = Cluster(processes) if isinstance(processes, str) else processes
             stack.enter_context(contextlib.closing(processes))
         if ignore_initial:
             if processes:

@@ -156,14 +156,9 @@ def report_data(summary: Summary, baseline: Baseline | None) -> dict:
         "is_whole": not summary.not_checked,
         "tiles": tiles,
         "intervals": [
-            (
-                interval.start,
-                interval.end,
-                interval.vertex_face_hits,
-                interval.edge_edge_hits,
-                *([interval.vertex_edge_hits + interval.vertex_vertex_hits] * scene.has_strands),
-            )
-            for interval in summary.intervals
+            (at.start, at.end, at.vertex_face_hits, at.edge_edge_hits, *of_strands[: scene.has_strands])
+            for at in summary.intervals
+            for of_strands in [[at.vertex_edge_hits + at.vertex_vertex_hits]]
         ],
         "rest": [(at.time, at.crossings, at.touches, sum(at.inside.values())) for at in summary.intersections],
         "near": [(at.time, at.pairs) for at in summary.proximities],
@@ -227,12 +222,7 @@ def _triage(summary: Summary) -> dict:
 
 def _nothing_found(summary: Summary) -> str:
     """Returns a sentence on what was checked if nothing was found in a whole replay, else an empty text."""
-    found = (
-        summary.hits
-        or summary.duplicate_spans
-        or summary.inversion_spans
-        or any(at.pairs for at in summary.proximities)
-    )
+    found = summary.hits or summary.duplicate_spans or summary.inversion_spans or summary.nearest
     if found or not summary.is_complete or not all(at.is_empty for at in summary.intersections):
         return ""
     if summary.scene.is_still and not summary.intersections:

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from .._sorted_keys import search
+from .._sorted_keys import KeySet
 from ..detection.arcs.rigid_motion import RigidMotion
 from ..detection.detector import Collisions
 from ..detection.mesh import CollisionMesh
@@ -17,17 +17,7 @@ from ..usd.interval import Interval, positions_of
 from ..usd.selection import Selection
 from .scene_arcs import positions_at
 from .scene_intersections import SceneIntersections, pair_keys, tangled_vertices
-from .scene_pairs import (
-    EDGE,
-    NO_PAIRS,
-    VERTEX,
-    ScenePairs,
-    are_stiff_pairs,
-    count_by_meshes,
-    name_elements,
-    split_rows,
-    take_rows,
-)
+from .scene_pairs import NO_PAIRS, VERTEX, ScenePairs, are_stiff, count_by_meshes, name_elements, split_rows, take_rows
 
 
 @dataclass(frozen=True)
@@ -63,7 +53,7 @@ class SceneContacts(ScenePairs):
     @cached_property
     def colliding_faces(self) -> np.ndarray:
         """Faces of the segment that collide or have an edge that collides, ascending."""
-        ends = self.vertices[self.elements >= EDGE]
+        ends = self.vertices[self.vertices[:, :, 1] >= 0]
         return np.union1d(self.faces[self.faces >= 0], self.segment.faces_at_edges(np.unique(ends, axis=0)))
 
     def colliding_polygons(self) -> dict[int, np.ndarray]:
@@ -131,11 +121,10 @@ def find_contacts(
     named = name_elements(segment, vertices, faces, ends, (points, point_ends.astype(np.int64), both))
     arrays = {"toi": tois, "position": position, "normal": normal}
     arrays = named | {name: np.concatenate(parts) for name, parts in arrays.items()}
-    if len(mesh.free_edges) + len(mesh.points):
-        first, second = named["meshes"].T
-        stiff = (first == second) & np.array([part.moves and not part.deforms for part in segment.meshes])[first]
-    else:
-        stiff = are_stiff_pairs(segment, vertices, named["meshes"][: len(vertices), 1], ends)
+    first, second = named["meshes"].T
+    stiff = (first == second) & np.array([part.moves and not part.deforms for part in segment.meshes])[first]
+    if segment.welded and not len(mesh.free_edges) + len(mesh.points):  # elements may be of several meshes
+        stiff = are_stiff(segment, vertices, named["meshes"][: len(vertices), 1], ends)
     parts = split_rows(arrays | {"stiff": stiff}, copies, len(intervals))
     return [_select(interval, part, selection) for interval, part in zip(intervals, parts, strict=True)]
 
@@ -175,8 +164,10 @@ def compare_contacts(
     """
     segment, counts = contacts[0].segment, [len(one) for one in contacts]
     separate, phase = np.zeros(sum(counts), dtype=bool), np.full(sum(counts), -1)
-    joined = {name: np.concatenate([getattr(one, name) for one in contacts]) for name in ScenePairs.BY_PAIR}
-    pairs = ScenePairs(segment, **joined)
+    pairs = contacts[0]
+    if len(contacts) > 1:
+        joined = {name: np.concatenate([getattr(one, name) for one in contacts]) for name in ScenePairs.BY_PAIR}
+        pairs = ScenePairs(segment, **joined)
     (rows,) = np.nonzero(_may_cross(pairs)) if len(pairs) else (np.zeros(0, dtype=np.int64),)
     if len(rows):
         times = list({id(found): found for both in at_rest for found in both}.values())
@@ -184,17 +175,19 @@ def compare_contacts(
         starts, ends = np.repeat([[number_of[id(found)] for found in both] for both in at_rest], counts, axis=0)[rows].T
         shift = len(segment.meshes) ** 2
         crossing = np.concatenate([found.mesh_keys() + number * shift for number, found in enumerate(times)])
-        separate[rows] = ~np.isin(pairs.mesh_keys()[rows] + starts * shift, crossing)
+        separate[rows] = ~KeySet(crossing).has(pairs.mesh_keys()[rows] + starts * shift)
         phase[rows] = 0
         firsts, others = pairs.vertices[rows, 0], pairs.vertices[rows, 1][:, [0, 1, 1]]
         seconds = np.where((pairs.kind[rows] == 0)[:, None], segment.faces[pairs.faces[rows, 1]], others)
         firsts = np.where(firsts < 0, firsts[:, :1], firsts)
-        keys, tangled = pair_keys(segment, firsts[:, :, None], seconds[:, None, :]), tangled_vertices(times)
-        if len(tangled):
-            for weight, numbers in ((2, starts), (1, ends)):
-                of_time = (keys + numbers[:, None, None] * segment.vertex_count**2).reshape(-1)
-                found = np.minimum(search(tangled, of_time), len(tangled) - 1)
-                phase[rows] += weight * (tangled[found] == of_time).reshape(-1, 6).any(axis=1)
+        tangled = KeySet(tangled_vertices(times))
+        for weight, numbers in ((2, starts), (1, ends)):
+            rest = np.arange(len(rows))  # those that no pair of vertices has shown yet to cross; one often suffices
+            for one, other in np.ndindex(2, 3):
+                keys = pair_keys(segment, firsts[rest, one], seconds[rest, other])
+                found = tangled.has(keys + numbers[rest] * segment.vertex_count**2)
+                phase[rows[rest[found]]] += weight
+                rest = rest[~found]
     parts = map(slice, np.cumsum([0, *counts]), np.cumsum(counts))
     return [replace(one, separate=separate[own], phase=phase[own]) for one, own in zip(contacts, parts, strict=False)]
 

@@ -169,7 +169,7 @@ class SceneIntersections(ScenePairs):
 def tangled_vertices(times: Sequence[SceneIntersections]) -> np.ndarray:
     """Returns the pairs of a vertex of an element and a vertex of a face that cross at some times of a segment.
 
-    They are given by their :func:`pair_keys`, plus the squared number of vertices for each time before, ascending.
+    They are given by their :func:`pair_keys`, plus the squared number of vertices for each time before.
     Elements are faces, and edges of curves.
     """
     segment = times[0].segment
@@ -184,7 +184,7 @@ def tangled_vertices(times: Sequence[SceneIntersections]) -> np.ndarray:
             keys.append((np.full(len(of_curves), i), of_curves, segment.faces[at.faces[at.of_curves, 1]]))
     number, first, second = (np.concatenate(arrays) for arrays in zip(*keys, strict=True))
     offsets = number[:, None, None] * segment.vertex_count**2
-    return distinct(pair_keys(segment, first[:, :, None], second[:, None, :]) + offsets)
+    return (pair_keys(segment, first[:, :, None], second[:, None, :]) + offsets).reshape(-1)
 
 
 def pair_keys(segment: Segment, first: np.ndarray, second: np.ndarray) -> np.ndarray:

@@ -219,7 +219,7 @@ def split_rows(arrays: dict[str, np.ndarray], copies: np.ndarray, count: int) ->
     return [{name: array[a:b] for name, array in ordered.items()} for a, b in pairwise(bounds)]
 
 
-def are_stiff_pairs(segment: Segment, vertices: np.ndarray, face_meshes: np.ndarray, ends: np.ndarray) -> np.ndarray:
+def are_stiff(segment: Segment, vertices: np.ndarray, face_meshes: np.ndarray, ends: np.ndarray) -> np.ndarray:
     """Returns whether each pair, as of :func:`name_elements`, is of one mesh that only its transform moves, bool."""
     rows, meshes = segment.meshes_at_edges(ends[:, 1])
     of_edges = segment.are_stiff(ends[rows, 0], meshes)

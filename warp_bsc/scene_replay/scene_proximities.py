@@ -9,7 +9,7 @@ from ..detection.at_rest.proximities import Proximities
 from ..detection.mesh import CollisionMesh
 from ..usd.segment import Segment
 from ..usd.selection import Selection
-from .scene_pairs import NEAR, NO_PAIRS, ScenePairs, are_stiff_pairs, name_elements
+from .scene_pairs import NEAR, NO_PAIRS, ScenePairs, are_stiff, name_elements
 
 
 @dataclass(frozen=True)
@@ -47,6 +47,6 @@ def name_proximities(
     named = name_elements(segment, vertices, faces, ends)
     meshes = named["meshes"]
     counted = selection.counted_pairs(segment.meshes, meshes) & ~selection.ignored_pairs(segment.meshes, meshes)
-    counted &= ~are_stiff_pairs(segment, vertices, meshes[: len(vertices), 1], ends)
+    counted &= ~are_stiff(segment, vertices, meshes[: len(vertices), 1], ends)
     arrays = named | {"position": found.position, "distance": found.distance}
     return SceneProximities(segment, **{name: array[counted] for name, array in arrays.items()}, time=time)

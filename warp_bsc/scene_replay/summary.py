@@ -203,7 +203,7 @@ class Summary:
     def collision_spans(self) -> list[CollisionSpan]:
         """The times over which two meshes collide, by their start, then by descending number of hits."""
         begun = (
-            {meshes: CollisionSpan(meshes, at.start, at.end, hits) for meshes, hits in at.mesh_pairs.items()}
+            [CollisionSpan(meshes, at.start, at.end, hits) for meshes, hits in at.mesh_pairs.items()]
             for at in self.intervals
         )
         joined = _joined(begun, lambda a, b: replace(a, until=b.until, hits=a.hits + b.hits))
@@ -247,12 +247,7 @@ class Summary:
     def proximity_spans(self) -> list[ProximitySpan]:
         """The times over which two meshes are near each other, by their start, then by ascending distance."""
         begun = (
-            {
-                (meshes := (min(near.meshes), max(near.meshes))): ProximitySpan(
-                    meshes, at.time, at.time, near.distance, at.time
-                )
-                for near in at.nearest
-            }
+            [ProximitySpan((min(n.meshes), max(n.meshes)), at.time, at.time, n.distance, at.time) for n in at.nearest]
             for at in self.proximities
         )
         near = _joined(begun, lambda a, b: replace(b if b.distance < a.distance else a, since=a.since, until=b.until))
@@ -261,19 +256,14 @@ class Summary:
     @cached_property
     def duplicate_spans(self) -> list[DuplicateSpan]:
         """The times over which meshes are duplicates of each other, by their start."""
-        begun = ({meshes: DuplicateSpan(meshes, at.start, at.end) for meshes in at.duplicates} for at in self.intervals)
+        begun = ([DuplicateSpan(meshes, at.start, at.end) for meshes in at.duplicates] for at in self.intervals)
         return sorted(_joined(begun, lambda a, b: replace(a, until=b.until)), key=lambda span: span.since)
 
     @cached_property
     def inversion_spans(self) -> list[InversionSpan]:
         """The times over which tetrahedra of a mesh are inverted, by their start."""
         begun = (
-            {
-                found.meshes: InversionSpan(
-                    found.meshes, at.start, at.end, found.number, found.tetrahedra[0], found.times[0]
-                )
-                for found in at.inverted
-            }
+            [InversionSpan(n.meshes, at.start, at.end, n.number, n.tetrahedra[0], n.times[0]) for n in at.inverted]
             for at in self.intervals
         )
         joined = _joined(begun, lambda a, b: replace(a, until=b.until, most=max(a.most, b.most)))
@@ -311,17 +301,11 @@ class Summary:
     @property
     def validation(self) -> Validation | None:
         """The comparison of all intervals with the exact checker, which names them; None without validation."""
-        found = [
-            replace(
-                interval.validation,
-                disagreements=tuple(
-                    f"from time {interval.start:g} to {interval.end:g}: {line}"
-                    for line in interval.validation.disagreements
-                ),
-            )
-            for interval in self.intervals
-            if interval.validation
-        ]
+        found = []
+        for at in self.intervals:
+            if at.validation:
+                lines = (f"from time {at.start:g} to {at.end:g}: {line}" for line in at.validation.disagreements)
+                found.append(replace(at.validation, disagreements=tuple(lines)))
         return functools.reduce(Validation.__add__, found) if found else None
 
     @property
@@ -373,10 +357,10 @@ def _count(number: int, one: str) -> str:
     return f"{number:,} {one}{'s' * (number != 1)}"
 
 
-def _joined(times: Iterable[dict[tuple[str, ...], _Span]], join: Callable[[_Span, _Span], _Span]) -> list[_Span]:
-    """Returns the spans of consecutive times, given those of each time by their meshes, and what joins two."""
+def _joined(times: Iterable[list[_Span]], join: Callable[[_Span, _Span], _Span]) -> list[_Span]:
+    """Returns the spans of consecutive times, given those of each time, and what joins two of the same meshes."""
     spans, running = [], {}
-    for found in times:
+    for found in ({span.meshes: span for span in begun} for begun in times):
         spans += [span for meshes, span in running.items() if meshes not in found]
         both = {meshes: join(span, found[meshes]) for meshes, span in running.items() if meshes in found}
         running = both | {meshes: span for meshes, span in found.items() if meshes not in both}

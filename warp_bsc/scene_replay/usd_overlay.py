@@ -281,14 +281,13 @@ class Overlay(ReplayOutput):
 
     def _find_points(self, pairs: ScenePairs, rows: np.ndarray, values: dict[str, np.ndarray]) -> Sample:
         """Returns some pairs as points with their values."""
-        prims, indices = self._number_prims(pairs.segment, pairs.meshes[rows]), pairs.indices[rows]
+        indices = pairs.indices[rows]
         arrays = {
             "extent": _box(pairs.position[rows], _MARKER_SIZE * self._size / 2),
             "positions": pairs.position[rows],
             "protoIndices": np.zeros(len(rows)),
             **{f"primvars:{name}": value[rows] for name, value in values.items()},
-            "primvars:primA": prims[:, 0],
-            "primvars:primB": prims[:, 1],
+            **self._number_prims(pairs.segment, pairs.meshes[rows]),
             "primvars:elementA": indices[:, 0],
             "primvars:elementB": indices[:, 1],
         }
@@ -297,21 +296,21 @@ class Overlay(ReplayOutput):
     def _find_curves(self, found: SceneIntersections, rows: np.ndarray) -> Sample:
         """Returns some segments in which triangles meet as curves."""
         cuts = found.cuts
-        prims, points = self._number_prims(found.segment, cuts.meshes[rows]), cuts.points[rows].reshape(-1, 3)
+        points = cuts.points[rows].reshape(-1, 3)
         arrays = {
             "extent": _box(points, _CURVE_WIDTH * self._size / 2),
             "points": points,
             "curveVertexCounts": np.full(len(rows), 2),
-            "primvars:primA": prims[:, 0],
-            "primvars:primB": prims[:, 1],
+            **self._number_prims(found.segment, cuts.meshes[rows]),
         }
         return Sample(arrays)
 
-    def _number_prims(self, segment: Segment, meshes: np.ndarray) -> np.ndarray:
-        """Returns numbers of meshes of a segment that hold for the whole layer."""
+    def _number_prims(self, segment: Segment, meshes: np.ndarray) -> dict[str, np.ndarray]:
+        """Returns the primvars with the numbers of two meshes of a segment that hold for the whole layer."""
         used, rows = np.unique(meshes, return_inverse=True)
         names = [segment.meshes[mesh].name for mesh in used]
-        return np.array([self._prims.setdefault(name, len(self._prims)) for name in names])[rows].reshape(-1, 2)
+        both = np.array([self._prims.setdefault(name, len(self._prims)) for name in names])[rows].reshape(-1, 2)
+        return dict(zip(("primvars:primA", "primvars:primB"), both.T, strict=True))
 
     def _facts(self, summary: Summary) -> dict[str, Any]:
         """Returns what programs read of the layer without its prims."""
@@ -322,15 +321,10 @@ class Overlay(ReplayOutput):
             facts["collisionsNotListed"] = missing.collisions[0]
         if summary.intersections:
             facts["timesWithIntersections"] = sum(bool(at.crossings + at.touches) for at in summary.intersections)
-        if summary.stopped:
-            facts["stopped"] = summary.stopped
-        if summary.duplicate_spans:
-            facts["duplicates"] = [span.describe(len(span.meshes)) for span in summary.duplicate_spans]
-        if summary.inversion_spans:
-            facts["inversions"] = [span.describe() for span in summary.inversion_spans]
-        if self._scene.left_out:
-            facts["leftOut"] = self._scene.left_out
-        return facts
+        found = {"stopped": summary.stopped, "leftOut": self._scene.left_out}
+        found["duplicates"] = [span.describe(len(span.meshes)) for span in summary.duplicate_spans]
+        found["inversions"] = [span.describe() for span in summary.inversion_spans]
+        return facts | {name: fact for name, fact in found.items() if fact}
 
     def _scopes(self, used: set[str]) -> list[LayerScope]:
         """Returns the prims of pairs of meshes that have findings, the rest last."""

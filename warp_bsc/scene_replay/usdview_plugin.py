@@ -12,7 +12,6 @@ import numpy as np
 from pxr import Gf, Tf, Usd
 from pxr.Usdviewq.plugin import PluginContainer
 
-from ..usd.interval import Interval
 from ..usd.read.triage import select_by_triage
 from ..usd.scene import Scene
 from .checking import Checks, IntervalChecker
@@ -188,10 +187,8 @@ def _describe(result: IntervalResult, triage: str) -> str:
     if summary.earliest:
         text = f", the first at {summary.earliest.time:g}"
     if summary.intersections:
-        start, _ = summary.intersections
-        text += (
-            f"; at {start.time:g} {start.crossings:,} edges through faces, {sum(start.inside.values()):,} parts inside"
-        )
+        at, _ = summary.intersections
+        text += f"; at {at.time:g} {at.crossings:,} edges through faces, {sum(at.inside.values()):,} parts inside"
     if summary.inverted:
         text += f"; {sum(found.number for found in summary.inverted):,} inverted tetrahedra"
     text += f"; {sum(summary.ignored.values()):,} more are meant by {triage}" if triage else ""
@@ -203,18 +200,13 @@ def _to_hit(contacts: SceneContacts, row: int) -> Hit:
     ((first, second),), ((element, other),) = contacts.mesh_names(rows), contacts.element_names(rows)
     text = f"{first}, {element}, with {'its' if first == second else f'{second},'} {other} at {contacts.time[row]:g}"
     (paths,) = contacts.mesh_paths(rows)
-    return Hit(text, float(contacts.time[row]), paths, _box_of(contacts, row))
-
-
-def _box_of(contacts: SceneContacts, row: int) -> np.ndarray:
-    """Returns the corners of the bounding box of two elements when they meet, shape [2, 3]."""
-    interval: Interval = contacts.interval
     faces = contacts.faces[row][contacts.elements[row] == FACE]
     vertices = contacts.vertices[row]
     vertices = np.concatenate([vertices[vertices >= 0], contacts.segment.faces[faces].reshape(-1)])
-    toi = contacts.toi[row]
-    points = (1.0 - toi) * interval.x0[vertices].astype(np.float64) + toi * interval.x1[vertices].astype(np.float64)
-    return np.stack([points.min(axis=0), points.max(axis=0)])
+    toi, ends = contacts.toi[row], (contacts.interval.x0, contacts.interval.x1)
+    start, end = (x[vertices].astype(np.float64) for x in ends)
+    points = (1.0 - toi) * start + toi * end
+    return Hit(text, float(contacts.time[row]), paths, np.stack([points.min(axis=0), points.max(axis=0)]))
 
 
 Tf.Type.Define(HitsContainer)

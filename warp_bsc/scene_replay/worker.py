@@ -142,8 +142,15 @@ def find_selection_without_initial(job: bytes) -> Selection:
 
 
 def name_device(name: str | None) -> str:
-    """Returns the name of the device that this worker uses."""
-    return find_device(name).alias
+    """Returns the name of the device that this worker uses, of the requested ones; starts Warp."""
+    return find_device(device_of_worker(name, _local[0], gpu_count()) if _local else name).alias
+
+
+def prepare(devices: str | None) -> None:
+    """Imports what opens a scene, and starts Warp, before the first chunk of this worker."""
+    from ..usd.read import find_meshes  # noqa: F401, PLC0415 (imports pxr)
+
+    name_device(devices)
 
 
 def _open(job: bytes, first: int) -> _Opened:
@@ -156,8 +163,7 @@ def _open(job: bytes, first: int) -> _Opened:
         if version != __version__:
             raise ValueError(f"{_worker_name()}: this worker has version {__version__} of warp-bsc, not {version}")
         scene, checks = pickle.load(stream)
-        device = device_of_worker(checks.device, _local[0], gpu_count()) if _local else checks.device
-        checks = replace(checks, device=find_device(device).alias)
+        checks = replace(checks, device=name_device(checks.device))
         _opened = _Opened(job, IntervalChecker(scene, checks, _worker_name()), len(scene.left_out))
     return _opened
 

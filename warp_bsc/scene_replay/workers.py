@@ -30,11 +30,11 @@ from ..usd.scene import Scene
 from ..usd.selection import Selection
 from .checking import Checks
 from .results import IntervalResult
-from .worker import check_chunk, find_selection_without_initial, name_device, pack, serve, unpack
+from .worker import check_chunk, find_selection_without_initial, name_device, pack, prepare, serve, unpack
 
 _CHUNK_BYTES = 512 << 20  # of positions that a worker sends at a time
 _MOST_INTERVALS = 16  # in a chunk; each chunk reads and checks one time more than it has intervals
-_CHUNKS_EACH = 4  # fewest chunks for each worker, so that all workers end at about the same time
+_CHUNKS_EACH, _FEWEST = 4, 4  # fewest chunks of each worker, for all to end at about the same time, if they are as long
 _CONNECT_SECONDS = 10.0
 
 
@@ -65,6 +65,11 @@ class LocalWorkers:
         self._processes: dict[int, SpawnProcess] = {}  # by number
         self._is_closed = False
         self._threads = ThreadPoolExecutor(count, "worker", self._begin_thread)
+
+    def start(self, devices: str | None) -> None:
+        """Starts all processes, which import what they need and start their devices, the named ones."""
+        for _ in range(self.count):
+            self.submit(prepare, devices)
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Future:
         """Returns a future of the function's result in one of the processes."""
@@ -234,12 +239,14 @@ def checked_address(address: str) -> str:
     return address
 
 
-def checked_workers(workers: Any, devices: str | None) -> int | str:
-    """Returns a number of processes, by default that of the devices, or the address of a scheduler.
+def checked_workers(workers: Any, devices: str | None) -> int | str | LocalWorkers:
+    """Returns a number of processes, by default that of the devices, or the address of a scheduler, or processes.
 
     Raises TypeError or ValueError if it is neither, less than the devices, or of a cluster that is to use several.
     """
     count = len(device_names(devices))
+    if isinstance(workers, LocalWorkers):
+        return workers
     if not isinstance(workers, str):
         return checked_integer(count if workers is None else workers, "workers", count)
     if count > 1:
@@ -330,6 +337,7 @@ def cut_in_chunks(scene: Scene, first: int, worker_count: int) -> Iterator[tuple
     """Yields the chunks: the first interval and the one after the last of each."""
     position_bytes = max(1, 3 * scene.vertex_count * scene.dtype.itemsize)
     left, most = len(scene) - first, max(1, min(_MOST_INTERVALS, _CHUNK_BYTES // position_bytes))
-    count = min(left, max(_CHUNKS_EACH * worker_count, -(-left // most)))
+    each = min(_CHUNKS_EACH, max(1, left // (_FEWEST * worker_count)))
+    count = min(left, max(each * worker_count, -(-left // most)))
     for number in range(count):
         yield first + left * number // count, first + left * (number + 1) // count

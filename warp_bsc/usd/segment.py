@@ -325,20 +325,17 @@ class Segment:
             Bool array of shape [n].
         """
         stiff = np.array([mesh.moves and not mesh.deforms for mesh in self.meshes], dtype=bool)
-        are_stiff = np.zeros(len(elements), dtype=bool)
-        if stiff.any():
-            rows, own = self.meshes_at_vertices(elements) if elements.ndim == 1 else self.meshes_at_edges(elements)
-            are_stiff[rows[stiff[own] & (own == meshes[rows])]] = True
-        return are_stiff
+        if not self.welded or not stiff.any():
+            return stiff[meshes] & (self.locate_vertices(np.atleast_2d(elements.T)[0])[0] == meshes)
+        rows, own = self.meshes_at_vertices(elements) if elements.ndim == 1 else self.meshes_at_edges(elements)
+        return np.bincount(rows[stiff[own] & (own == meshes[rows])], minlength=len(elements)) > 0
 
     def faces_at_edges(self, ends: np.ndarray) -> np.ndarray:
         """Returns the faces that have any of the edges, shape [n, 2], smaller vertex first, as a side, ascending."""
         keys, sides = self._sides
         first, last = search_ranges(keys, self._side_keys(ends))
-        marked = np.zeros(len(keys) + 1, dtype=np.int64)
-        np.add.at(marked, first, 1)
-        np.add.at(marked, last, -1)
-        found = sides[np.cumsum(marked[:-1]) > 0]
+        begin, end = (np.bincount(places, minlength=len(keys) + 1) for places in (first, last))
+        found = sides[np.cumsum(begin - end)[:-1] > 0]
         return distinct(found[found < self._corners.size] // 3)
 
     @cached_property

@@ -5,12 +5,13 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from ..run.launch import launch
+from ..run.launch import launch_over
 from ..run.settings import NO_GRADIENTS
 
 
 @wp.kernel(**NO_GRADIENTS)
 def find_closest(
+    first: int,
     # mesh
     surface: wp.uint64,
     # in
@@ -22,7 +23,7 @@ def find_closest(
     distances: wp.array[wp.float32],
 ):
     """Finds the face that is closest to each point, barycentric coordinates of its closest point, and the distance."""
-    i = wp.tid()
+    i = first + wp.tid()
     query = wp.mesh_query_point_no_sign(surface, points[i], reach)
     if not query.result:
         faces[i] = 0
@@ -71,5 +72,5 @@ class ClosestPointFinder:
         count = len(points)
         given = wp.array(points, dtype=wp.vec3, device="cpu")
         outputs = [wp.empty(count, dtype=kind, device="cpu") for kind in (wp.int32, wp.vec3, wp.float32)]
-        launch(find_closest, count, inputs=[self._mesh.id, given, reach], outputs=outputs, device="cpu")
+        launch_over(find_closest, count, inputs=[self._mesh.id, given, reach], outputs=outputs, device=given.device)
         return ClosestPoints(*(array.numpy() for array in outputs))

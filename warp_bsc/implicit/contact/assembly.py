@@ -17,15 +17,7 @@ from .merit import add_energy, add_inertia
 from .pairs import Trial, listed_count
 from .rows import sum_of_blocks, sum_of_corners
 from .steps import way_of
-from .system import (
-    Unknowns,
-    block_sum_of_parts,
-    contact_block,
-    contact_gradient,
-    is_solved,
-    raise_to,
-    sum_of_parts,
-)
+from .system import Unknowns, block_sum_of_parts, contact_block, contact_gradient, is_solved, raise_to, sum_of_parts
 
 wp.set_module_options({"enable_backward": False})
 
