@@ -12,7 +12,6 @@ from ..mesh_files.mesh_file import is_mesh_file
 from ..repairing.shot.findings import count_found, kept_meshes, matching_meshes
 from ..repairing.shot.report import RepairPage
 from ..scene_replay.hit_files import replay_facts
-from ..usd.read.tetrahedra import NOT_REPAIRED
 from ..usd.scene import Scene
 from ..usd.write.points_layer import PointsLayer
 from .device import find_device, find_devices, load_detector, loading_kernels
@@ -208,7 +207,7 @@ def _run(arguments: argparse.Namespace) -> int:
     found = {"remaining": any(remaining.values()), "distorted": bool(run.distorted)}
     if any(found[reason] for reason in arguments.fail_on):
         return ExitStatus.FOUND
-    return ExitStatus.LEFT_OUT if scene.left_out or NOT_REPAIRED in kept.values() else ExitStatus.DONE
+    return ExitStatus.LEFT_OUT if scene.left_out or any(stretch.held for stretch in run.stretches) else ExitStatus.DONE
 
 
 def _open_usd(arguments: argparse.Namespace, chosen: dict[str, Any]) -> Scene:

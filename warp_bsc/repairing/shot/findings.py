@@ -43,6 +43,7 @@ class Finding:
         unrepaired_hits: Number of pairs that collide of meshes that stay as they are.
         kept_hits: Number of those of meshes that are kept.
         ignored_pairs: Pairs of meshes that collide and are ignored.
+        inverted: Number of tetrahedra that invert or are inverted; None if no mesh has any.
     """
 
     hits: int
@@ -55,6 +56,7 @@ class Finding:
     unrepaired_hits: int = 0
     kept_hits: int = 0
     ignored_pairs: tuple[MeshPair, ...] = ()
+    inverted: int | None = None
 
     @property
     def is_free(self) -> bool:
@@ -72,6 +74,8 @@ def count_found(findings: list[Finding], min_distance: float) -> dict[str, int]:
         counts["collisions of meshes that cross at the first frame"] = sum(
             finding.unrepaired_hits for finding in findings
         )
+    if any(finding.inverted is not None for finding in findings):
+        counts["inverted tetrahedra"] = sum(finding.inverted or 0 for finding in findings)
     return counts
 
 
@@ -175,6 +179,7 @@ def _find_collisions(results, selection, kept, unrepaired, min_distance, device)
             unrepaired_hits=unrepaired_hits,
             kept_hits=sum(summary.mesh_pairs.values()) - counted - unrepaired_hits,
             ignored_pairs=tuple(summary.ignored),
+            inverted=sum(f.number for f in summary.inverted) if interval.segment.tetrahedra.names else None,
         )
         last = interval.segment
 

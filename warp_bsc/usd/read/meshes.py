@@ -16,7 +16,6 @@ from .samples import as_time_code, sample_times
 from .shapes import MeshPolygons, Polygons, ShapePolygons, TetPolygons, is_shape
 from .skinning import Skin
 from .strands import Strands, is_strands
-from .tetrahedra import NOT_REPAIRED
 from .topology import BROKEN, Topologies, is_empty
 from .unreadable import UnreadableError, reading
 
@@ -229,7 +228,7 @@ class UsdMesh:
     def why_not_repaired(self) -> str | None:
         """Why a repair does not move the mesh, in words; None if it may."""
         if self.why_not_written or self.deforms:
-            return self.why_not_written or (NOT_REPAIRED if self.has_tetrahedra else None)
+            return self.why_not_written
         return "its points do not move, only its transform" if self.times else "it does not move"
 
     def read_points(self, time: float, *, before: bool = False) -> np.ndarray:

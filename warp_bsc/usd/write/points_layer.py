@@ -25,7 +25,7 @@ class MovedFrame:
         time: Time code.
         before: Whether the moment just before that time is meant, at which a mesh then jumps or a segment ends.
         segment: The meshes.
-        vertices: The moved vertices, shape [n].
+        vertices: The moved vertices, shape [n]; after those of the segment, the ones of its tetrahedra inside surfaces.
         x: Their positions in world space, float64, shape [n, 3].
     """
 
@@ -37,12 +37,16 @@ class MovedFrame:
 
     def by_mesh(self) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
         """Yields the number of each mesh with moved vertices, these among its prim's points, and their positions."""
-        rows = np.full(self.segment.vertex_count, -1)
+        count, tetrahedra = self.segment.vertex_count, self.segment.tetrahedra
+        rows = np.full(count + tetrahedra.vertex_count, -1)
         rows[self.vertices] = np.arange(len(self.vertices))
         for number, mesh in enumerate(self.segment.meshes):
-            own = rows[self.segment.vertices_of(number)]
+            own, points = rows[self.segment.vertices_of(number)], mesh.points
+            if mesh.name in tetrahedra.points:
+                numbers, inner = tetrahedra.points[mesh.name]
+                own, points = np.append(own, rows[count:][numbers]), np.append(points, inner)
             if (own >= 0).any():
-                yield number, mesh.points[own >= 0], self.x[own[own >= 0]]
+                yield number, points[own >= 0], self.x[own[own >= 0]]
 
 
 class PointsLayer:
@@ -84,7 +88,7 @@ class PointsLayer:
         """
         for number, points, positions in frame.by_mesh():
             name = frame.segment.meshes[number].name
-            x = _to_own_space(self._scene.prim_of(name), positions, frame.time, frame.before)
+            x = to_own_space(self._scene.prim_of(name), positions, frame.time, frame.before)
             self._moved.setdefault(name, {})[frame.time, frame.before] = self._moves.tell(), len(points)
             rest = memoryview(points.astype(np.int64).tobytes() + x.tobytes())
             while rest:
@@ -245,10 +249,10 @@ def _own_points(mesh: "UsdMesh", time: float, before: bool) -> np.ndarray:
         return points
     transform = mesh.read_transform(time, before=before)
     assert transform is not None  # no instancer places it
-    return _to_own_space(mesh, points @ transform[:3, :3] + transform[3, :3], time, before)
+    return to_own_space(mesh, points @ transform[:3, :3] + transform[3, :3], time, before)
 
 
-def _to_own_space(mesh: "UsdMesh", positions: np.ndarray, time: float, before: bool) -> np.ndarray:
+def to_own_space(mesh: "UsdMesh", positions: np.ndarray, time: float, before: bool) -> np.ndarray:
     """Returns positions in world space at, or just before, a time in the space of a mesh's prim, float32."""
     from pxr import UsdGeom  # noqa: PLC0415 (slow)
 
