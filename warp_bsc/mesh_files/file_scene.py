@@ -170,6 +170,7 @@ class FrameMesh:
 
     display_name, instanced_prim = "", ""
     is_strands = is_rigid = may_jump = has_tetrahedra = False
+    why_not_written = None
 
     def __init__(self, name: str, paths: dict[float, str], moves: bool):
         self.name = self.path = name

@@ -91,8 +91,10 @@ def kept_meshes(scene: Scene, keep: Iterable[str] = ()) -> dict[str, str]:
         ValueError: If a pattern matches no mesh.
     """
     kept = dict.fromkeys(matching_meshes(scene, keep, "keep"), "it is to be kept")
-    reasons = {prim.name: prim.why_not_repaired for prim in map(scene.prim_of, scene.names) if prim.why_not_repaired}
-    return reasons | kept
+    prims = [scene.prim_of(name) for name in scene.names]
+    is_still = not any(prim.times for prim in prims)  # all may be moved then
+    reasons = {prim.name: prim.why_not_written if is_still else prim.why_not_repaired for prim in prims}
+    return {name: why for name, why in reasons.items() if why} | kept
 
 
 def matching_meshes(scene: Scene, patterns: Iterable[str], what: str) -> list[str]:

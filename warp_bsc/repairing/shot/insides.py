@@ -1,6 +1,7 @@
 """Moves the inside of tetrahedra with their repaired surfaces, without inverting any that the shot does not invert."""
 
 import itertools
+from collections.abc import Container
 from dataclasses import replace
 from typing import Any
 
@@ -21,6 +22,9 @@ Moment = tuple[float, bool]
 
 _SWEEPS = 200
 """Sweeps that spread the displacements of surfaces to their insides."""
+_SMALLEST, _INFLATIONS, _OVERSHOOT = 0.1, 100, 2.0
+"""Volume that inner vertices are moved for, as a share of that in the shot, in at most so many Jacobi sweeps, and the
+factor of their moves, which are means over tetrahedra."""
 _SHRINKING, _SHRINKINGS = 0.5, 8
 """Factor of the displacements around tetrahedra that invert, and how often; after that, their body stays in its place.
 """
@@ -31,7 +35,16 @@ _BY_EDGE, _BY_FRAME = 0.125, 0.25
 class Insides:
     """The tetrahedra of a segment. Arrays of n rows are of their vertices, in the spaces of their prims."""
 
-    def __init__(self, scene: Scene, segment: Segment, is_movable: np.ndarray, given: np.ndarray, device: Any):
+    def __init__(
+        self,
+        scene: Scene,
+        segment: Segment,
+        is_movable: np.ndarray,
+        given: np.ndarray,
+        *,
+        rigid: Container[str] = (),
+        device: Any = None,
+    ):
         """Finds the vertices inside surfaces.
 
         Args:
@@ -39,25 +52,29 @@ class Insides:
             segment: The segment.
             is_movable: Whether each vertex of the segment may be moved, bool.
             given: Positions at some time, float64, shape [n, 3].
+            rigid: Names of meshes whose connected pieces move as a whole.
             device: Warp device.
         """
-        tetrahedra = segment.tetrahedra
-        self._corners = tetrahedra.corners
-        self._vertex = np.full(len(given), -1)  # of the segment; -1 inside surfaces
-        self._parts, is_inner = [], np.zeros(len(given), dtype=bool)
+        tetrahedra, count = segment.tetrahedra, len(given)
+        self._corners, self._body = tetrahedra.corners, connect_cells(tetrahedra.corners, count)
+        self._vertex = np.full(count, -1)  # of the segment; -1 inside surfaces
+        self._parts, fixed, group = [], np.ones(count, dtype=bool), np.full(count, -1)
         for number, mesh in enumerate(segment.meshes):
             vertices = segment.vertices_of(number)
             if mesh.name in tetrahedra.points and is_movable[vertices].any():
                 rows, points = tetrahedra.points[mesh.name]
                 at = np.minimum(np.searchsorted(mesh.points, points), len(mesh.points) - 1)
                 self._vertex[rows] = np.where(mesh.points[at] == points, vertices[at], -1)
-                is_inner[rows] = self._vertex[rows] < 0
+                fixed[rows] = False
+                group[rows] = self._body[rows] if mesh.name in rigid else -1
                 self._parts.append((scene.prim_of(mesh.name), rows))
-        mesh = CollisionMesh(np.zeros((0, 3), int), len(given), tets=self._corners, device=device)
+        mesh = CollisionMesh(np.zeros((0, 3), int), count, tets=self._corners, device=device)
         self._detector = CollisionDetector(mesh, method="exact")
-        surface = Surface(mesh, given, ~is_inner, tetrahedra=self._corners)
-        self._edges, self._springs = surface.edges, Springs(surface, is_inner)
-        self._body = connect_cells(self._corners, len(given))
+        surface = Surface(mesh, given, fixed, tetrahedra=self._corners, rigid=group)
+        self._edges, self._rigid = surface.edges, surface.rigid
+        self._is_inner = (self._vertex < 0) & ~fixed
+        self._springs = Springs(surface, self._is_inner)
+        self._around = self._corners[self._is_inner[self._corners].any(axis=1)]
 
     def follow(
         self, frames: list[ShotFrame], given: list[np.ndarray], moments: list[Moment], origin: np.ndarray
@@ -75,57 +92,79 @@ class Insides:
         Returns:
             The frames, and by the name of a mesh the times at which it is moved less.
         """
-        shot = list(zip(frames, given, moments, strict=True))
-        moves = []
-        for frame, x, moment in shot:
-            _, on_surface = self._placed(frame, x, moment, np.zeros_like(x), np.ones(len(x)), origin)
-            moves.append(self._springs.spread(on_surface - x, ~self._springs.movable, _SWEEPS))
-        share, in_shot = np.ones((len(shot), len(self._body))), {}
+        share, is_new, in_shot = np.ones((len(frames), len(self._body))), np.ones(len(frames), dtype=bool), {}
+        found: dict[int, tuple[ShotFrame, np.ndarray]] = {}
         for attempt in itertools.count():
-            found = [self._placed(*one, *how, origin) for one, *how in zip(shot, moves, share, strict=True)]
-            inverts = self._inverting([x for _, x in found], given, in_shot)
+            for k in np.flatnonzero(is_new).tolist():
+                found[k] = self._placed(frames[k], given[k], moments[k], share[k], origin)
+            inverts = self._inverting([found[k][1] for k in range(len(frames))], given, in_shot)
             if not inverts.any():
                 break
             if attempt < _SHRINKINGS:
-                share = self._eased(np.where(inverts, _SHRINKING * share, share))
+                less = self._eased(np.where(inverts, _SHRINKING * share, share))
             else:
-                share[:, np.isin(self._body, self._body[inverts.any(axis=0)])] = 0.0
-        is_less = (share < 1.0) & np.array([move.any(axis=1) for move in moves])
+                less = np.where(np.isin(self._body, self._body[inverts.any(axis=0)]), 0.0, share)
+            is_new, share = (less != share).any(axis=1), less
+        on_surface = np.array([(frame.x != frame.given).any(axis=1)[self._vertex] for frame in frames])
+        is_less = (share < 1.0) & (self._vertex >= 0) & on_surface
         are_less = is_less.any(axis=1)
-        after_less = are_less | np.append(False, are_less[:-1])
-        frames = [replace(f, certified=f.certified and not less) for (f, _), less in zip(found, after_less, strict=True)]
+        certified = ~(are_less | np.append(False, are_less[:-1]))
+        frames = [replace(found[k][0], certified=f.certified and bool(certified[k])) for k, f in enumerate(frames)]
         times = np.array([time for time, _ in moments])
         held = {prim.name: times[is_less[:, rows].any(axis=1)].tolist() for prim, rows in self._parts}
         return frames, {name: at for name, at in held.items() if at}
 
     def _placed(
-        self,
-        frame: ShotFrame,
-        given: np.ndarray,
-        moment: Moment,
-        moves: np.ndarray,
-        share: np.ndarray,
-        origin: np.ndarray,
+        self, frame: ShotFrame, given: np.ndarray, moment: Moment, share: np.ndarray, origin: np.ndarray
     ) -> tuple[ShotFrame, np.ndarray]:
         """Returns a frame with a share of its moves, and the positions that a layer has, float64, shape [n, 3]."""
         on_surface = self._vertex >= 0
         if (share < 1.0).any():
-            of_vertex = np.ones(len(frame.x), np.float32)
-            np.minimum.at(of_vertex, self._vertex[on_surface], share[on_surface].astype(np.float32))
-            less = frame.given + of_vertex[:, None] * (frame.x - frame.given)
-            frame = replace(frame, x=np.where(of_vertex[:, None] < 1.0, less, frame.x))
-        moves = moves * share[:, None]
-        is_moved = np.where(on_surface, (frame.x != frame.given).any(axis=1)[self._vertex], moves.any(axis=1))
-        placed, world = given.copy(), np.where(on_surface[:, None], frame.x[self._vertex] + origin, 0.0)
+            of_vertex = np.ones((len(frame.x), 1), np.float32)
+            np.minimum.at(of_vertex[:, 0], self._vertex[on_surface], share[on_surface].astype(np.float32))
+            less = frame.given + of_vertex * (frame.x - frame.given)
+            frame = replace(frame, x=np.where(of_vertex < 1.0, less, frame.x))
+        x, world = given.copy(), np.zeros_like(given)
+
+        def place(is_moved: np.ndarray) -> None:
+            for prim, rows in self._parts:
+                moved = rows.start + np.flatnonzero(is_moved[rows])
+                x[moved] = to_own_space(prim, world[moved], *moment)
+
+        moved = on_surface & (frame.x != frame.given).any(axis=1)[self._vertex]
+        world[moved] = frame.x[self._vertex[moved]] + origin
+        place(moved)
+        inside = self._inside(x, given)
+        moved = self._is_inner & (inside != given).any(axis=1)
         for prim, rows in self._parts:
-            own = np.arange(rows.start, rows.stop)[is_moved[rows]]
-            inner = own[~on_surface[own]]
             transform = prim.read_transform(moment[0], before=moment[1])
-            world[inner] = (given[inner] + moves[inner]) @ transform[:3, :3] + transform[3, :3]
-            placed[own] = to_own_space(prim, world[own], *moment)
-        (inner,) = np.nonzero(is_moved & ~on_surface)
-        lengths = np.linalg.norm(moves[inner], axis=1)
-        return replace(frame, inner=InnerVertices(inner, world[inner], lengths)), placed
+            world[rows] = inside[rows] @ transform[:3, :3] + transform[3, :3]
+        place(moved)
+        inner = np.flatnonzero(moved)
+        moves = np.linalg.norm(inside[inner] - given[inner], axis=1)
+        return replace(frame, inner=InnerVertices(inner, world[inner], moves)), x
+
+    def _inside(self, x: np.ndarray, given: np.ndarray) -> np.ndarray:
+        """Returns positions in which the vertices inside surfaces follow, given those of the shot."""
+        if (x == given).all():
+            return x
+        x = given + self._springs.spread(x - given, ~self._is_inner, _SWEEPS)
+        if len(vertices := self._rigid.vertices):
+            fitted = self._rigid.fitted(x, given, np.where(self._is_inner[vertices], 0.0, 1.0))
+            x[vertices] = np.where(self._is_inner[vertices][:, None], fitted, x[vertices])
+        volumes = _volumes(given[self._around])[0]
+        corners, least = self._around[volumes > 0.0], _SMALLEST * volumes[volumes > 0.0]
+        for _ in range(_INFLATIONS):
+            volumes, slopes = _volumes(x[corners])
+            (low,) = np.nonzero(volumes < least)
+            if not len(low):
+                break
+            at, slopes = corners[low], slopes[low] * self._is_inner[corners[low]][:, :, None]
+            moves, counts = np.zeros_like(x), np.bincount(at.ravel(), minlength=len(x))[:, None]
+            steps = (least[low] - volumes[low]) / np.maximum((slopes**2).sum(axis=(1, 2)), 1e-30)
+            np.add.at(moves, at, steps[:, None, None] * slopes)
+            x = x + _OVERSHOOT * moves / np.maximum(counts, 1)
+        return x
 
     def _inverting(
         self, x: list[np.ndarray], given: list[np.ndarray], in_shot: dict[int, np.ndarray]
@@ -149,11 +188,19 @@ class Insides:
 
     def _eased(self, share: np.ndarray) -> np.ndarray:
         """Returns shares that change slowly along edges and from frame to frame, none larger than it was."""
-        ends, by_vertex = self._edges[:, [[0, 1], [1, 0]]].transpose(1, 2, 0).reshape(2, -1), share.T.copy()
+        first, second = np.concatenate([self._edges, self._edges[:, ::-1]]).T
+        by_vertex = share.T.copy()
         for _ in range(int(1.0 / _BY_EDGE)):
-            np.minimum.at(by_vertex, ends[0], by_vertex[ends[1]] + _BY_EDGE)
+            np.minimum.at(by_vertex, first, by_vertex[second] + _BY_EDGE)
         share = by_vertex.T
         for _ in range(int(1.0 / _BY_FRAME)):
             share[1:] = np.minimum(share[1:], share[:-1] + _BY_FRAME)
             share[:-1] = np.minimum(share[:-1], share[1:] + _BY_FRAME)
         return share
+
+
+def _volumes(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns six times the volumes of tetrahedra, and their gradients, given positions of shape [m, 4, 3]."""
+    b, c, d = (x[:, i] - x[:, 0] for i in (1, 2, 3))
+    slopes = np.cross(c, d), np.cross(d, b), np.cross(b, c)
+    return np.einsum("ij,ij->i", d, slopes[2]), np.stack([-slopes[0] - slopes[1] - slopes[2], *slopes], axis=1)

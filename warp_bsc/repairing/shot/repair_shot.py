@@ -204,7 +204,8 @@ class _Shot:
             self._insides = None
             if any(mesh.name in segment.tetrahedra.points and mesh.name not in self._kept for mesh in segment.meshes):
                 given, _ = self._scene.interval(index).tet_positions
-                self._insides = Insides(self._scene, segment, is_movable, given, self._device)
+                options = {"rigid": self._hard, "device": self._device}
+                self._insides = Insides(self._scene, segment, is_movable, given, **options)
         return self._scene.interval(index)
 
     def _single(self, x) -> np.ndarray:
@@ -253,6 +254,9 @@ class _Shot:
             if index >= stop and not frame.differs:
                 break
             interval = self._scene.interval(index)
+            if interval.is_at_rest:  # the first frame, which is repaired by itself
+                yield frame
+                continue
             given, arcs = self._single(interval.x1), self._arcs(interval)
             if displacements is None:
                 displacement = _FADING * frame.displacement

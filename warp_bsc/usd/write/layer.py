@@ -39,7 +39,7 @@ class SceneLayer:
     @contextlib.contextmanager
     def writing(
         self, file: OutputFile, documentation: str, custom: dict[str, dict[str, Any]], end: float | None = None
-    ) -> Iterator[tuple[Any, Callable[[str, str, float, np.ndarray], None]]]:
+    ) -> Iterator[tuple[Any, Callable[[str, str, float | None, np.ndarray], None]]]:
         """Makes the layer, which the block fills, with results and errors of :func:`new_layer`; then commits the file.
 
         Args:

@@ -52,7 +52,8 @@ class MovedFrame:
 class PointsLayer:
     """A layer whose sublayer is the scene, so that opening it shows the scene with the moved points.
 
-    A moved mesh has a sample of its points at each time of the scene and of its own. Points that are not moved have the
+    A moved mesh has a sample of its points at each time of the scene and of its own; one that has no samples has none
+    here either, but other points. Points that are not moved have the
     bits of the scene. Meshes that are not moved at any time have no opinion in the layer. A skeleton or blend shapes no
     longer deform a moved mesh: its points are those that they would give it. Authored normals turn with the surface,
     authored extents are computed again where points move, authored velocities get the velocity of the displacement, and
@@ -140,7 +141,7 @@ class PointsLayer:
             blocked.default = Sdf.ValueBlock()
         frames = [(*key, *self._points(mesh, *key)) for key in self._times(mesh)]
         for index, (time, before, old, new) in enumerate(frames):
-            code = just_before(time) if before else time
+            code = None if not mesh.times else just_before(time) if before else time
             following = frames[index + 1] if index + 1 < len(frames) else None
             if following is not None and following[0] > time and len(following[2]) == len(old):
                 seconds = (following[0] - time) / self._scene.time_codes_per_second
@@ -187,7 +188,7 @@ class _Surface:
     def __init__(self, mesh: "UsdMesh"):
         from pxr import UsdGeom  # noqa: PLC0415 (slow)
 
-        self._schema = UsdGeom.Mesh(mesh.prim)
+        self._mesh, self._schema = mesh, UsdGeom.Mesh(mesh.prim)
         primvar = UsdGeom.PrimvarsAPI(mesh.prim).GetPrimvar("normals")
         has_primvar = primvar and primvar.HasAuthoredValue() and not primvar.IsIndexed()
         self._normals = primvar.GetAttr() if has_primvar else self._schema.GetNormalsAttr()
@@ -220,8 +221,12 @@ class _Surface:
 
     def _turn(self, normals, old, new, time) -> np.ndarray:
         """Returns authored normals turned with the surface; those of a constant or of another number stay."""
-        counts = np.array(self._schema.GetFaceVertexCountsAttr().Get(time))
-        corners = np.array(self._schema.GetFaceVertexIndicesAttr().Get(time))
+        if self._mesh.has_tetrahedra:
+            corners = self._mesh.read_triangles(time, old)[0].ravel()
+            counts = np.full(len(corners) // 3, 3)
+        else:
+            counts = np.array(self._schema.GetFaceVertexCountsAttr().Get(time))
+            corners = np.array(self._schema.GetFaceVertexIndicesAttr().Get(time))
         (a_faces, a_points), (b_faces, b_points) = (_normals_of(x, counts, corners) for x in (old, new))
         by_interpolation = {
             "vertex": (a_points, b_points),
