@@ -25,11 +25,10 @@ _SWEEPS = 200
 _SMALLEST, _INFLATIONS, _OVERSHOOT = 0.1, 100, 2.0
 """Volume that inner vertices are moved for, as a share of that in the shot, in at most so many Jacobi sweeps, and the
 factor of their moves, which are means over tetrahedra."""
-_SHRINKING, _SHRINKINGS = 0.5, 8
-"""Factor of the displacements around tetrahedra that invert, and how often; after that, their body stays in its place.
-"""
-_BY_EDGE, _BY_FRAME = 0.125, 0.25
-"""Largest difference between the shares of displacements that are left, along an edge, and from frame to frame."""
+_ATTEMPTS = 8
+"""Times that vertices of tetrahedra that invert are left as in the shot; after that, their bodies are."""
+_BY_EDGE, _BY_FRAME = 1.0 / 16.0, 1.0 / 8.0
+"""Growth of the share of the displacements that is kept around these, along an edge and from frame to frame."""
 
 
 class Insides:
@@ -81,7 +80,7 @@ class Insides:
     ) -> tuple[list[ShotFrame], dict[str, list[float]]]:
         """Returns consecutive frames with what moves inside surfaces, and where it could not follow.
 
-        There, around tetrahedra that would invert, surfaces are moved less than contacts need.
+        There, tetrahedra that would invert are as in the shot, and surfaces around them move less than contacts need.
 
         Args:
             frames: The frames, whose surfaces are repaired.
@@ -100,8 +99,8 @@ class Insides:
             inverts = self._inverting([found[k][1] for k in range(len(frames))], given, in_shot)
             if not inverts.any():
                 break
-            if attempt < _SHRINKINGS:
-                less = self._eased(np.where(inverts, _SHRINKING * share, share))
+            if attempt < _ATTEMPTS:
+                less = self._eased(np.where(inverts, 0.0, share))
             else:
                 less = np.where(np.isin(self._body, self._body[inverts.any(axis=0)]), 0.0, share)
             is_new, share = (less != share).any(axis=1), less

@@ -10,6 +10,7 @@ import numpy as np
 from ..._arguments import check_instance, checked_distance, checked_integer
 from ...detection.arcs.rigid_motion import RigidMotion
 from ...detection.at_rest.body_parts import connect_cells
+from ...detection.detector import CollisionDetector
 from ...detection.mesh import CollisionMesh
 from ...scene_replay.scene_arcs import arcs_of
 from ...usd.interval import Interval, times_in_words
@@ -317,6 +318,10 @@ class _Shot:
         given += [self._scene.interval(index).tet_positions[1] for index in numbers]
         moments = [self._moment(first, number) for number in range(len(frames))]
         frames, held = self._insides.follow(frames, given, moments, self._origin)
+        if held and self._scene.interval(first).is_at_rest:  # then it does not cross more than it did
+            finder, (frame, *_) = CollisionDetector(self._follower.mesh), frames
+            if len(finder.find_intersections(frame.x)) > len(finder.find_intersections(frame.given)):
+                frames = [ShotFrame.of_shot(frame.given)] * len(frames)
         reasons += [
             f"{name} is moved less than contacts need {times_in_words(times)}, as its tetrahedra would invert"
             for name, times in held.items()
