@@ -27,7 +27,7 @@ def block(cells, size):
     return grid * size, tets
 
 
-def pressed_bar(path, frames=16, depth=0.25, cells=(6, 2, 2), transform=None, surface=False):
+def pressed_bar(path, frames=12, depth=0.25, cells=(5, 2, 2), transform=None, surface=False):
     """A bar of cells of 0.2 that waves, a box that comes down into it and leaves, and a transform of the bar."""
     stage = new_stage(path)
     points, tets = block(cells, 0.2)

@@ -165,9 +165,7 @@ class Insides:
             x = x + _OVERSHOOT * moves / np.maximum(counts, 1)
         return x
 
-    def _inverting(
-        self, x: list[np.ndarray], given: list[np.ndarray], in_shot: dict[int, np.ndarray]
-    ) -> np.ndarray:
+    def _inverting(self, x: list[np.ndarray], given: list[np.ndarray], in_shot: dict[int, np.ndarray]) -> np.ndarray:
         """Returns the vertices of tetrahedra that invert at frames, or on the way to the next, and not in the shot.
 
         Args:

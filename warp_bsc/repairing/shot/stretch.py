@@ -152,8 +152,7 @@ class StretchRecorder:
         self._ratios.append((float(ratio.min(initial=1.0)), float(ratio.max(initial=1.0))))
 
     def finish(self, reasons: list[str], held: tuple[str, ...] = ()) -> RepairedStretch:
-        """Returns the stretch; ``reasons`` say why collisions remain, and ``held`` are as :attr:`RepairedStretch.held`.
-        """
+        """Returns the stretch; ``reasons`` say why collisions remain, and ``held`` are as :attr:`RepairedStretch.held`."""
         return RepairedStretch(
             start=self._times[0],
             end=self._times[-1],

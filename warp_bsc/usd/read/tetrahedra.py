@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+
 class Tetrahedra:
     """The tetrahedra of some meshes, merged to one list, and the positions of their vertices.
 

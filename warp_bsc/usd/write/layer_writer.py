@@ -57,7 +57,9 @@ class LayerPrim:
 
 
 @contextlib.contextmanager
-def new_layer(path: Path, file_format: str) -> Iterator[tuple[Any, Callable[[str, str, float | None, np.ndarray], None]]]:
+def new_layer(
+    path: Path, file_format: str
+) -> Iterator[tuple[Any, Callable[[str, str, float | None, np.ndarray], None]]]:
     """Makes a layer in USD's binary format, in which saved samples leave the memory, and saves it after the block.
 
     Args:
