@@ -104,8 +104,8 @@ class Insides:
             else:
                 less = np.where(np.isin(self._body, self._body[inverts.any(axis=0)]), 0.0, share)
             is_new, share = (less != share).any(axis=1), less
-        on_surface = np.array([(frame.x != frame.given).any(axis=1)[self._vertex] for frame in frames])
-        is_less = (share < 1.0) & (self._vertex >= 0) & on_surface
+        is_moved = np.array([frame.x != frame.given for frame in frames]).any(axis=2)
+        is_less = (share < 1.0) & (self._vertex >= 0) & is_moved[:, self._vertex]
         are_less = is_less.any(axis=1)
         certified = ~(are_less | np.append(False, are_less[:-1]))
         frames = [replace(found[k][0], certified=f.certified and bool(certified[k])) for k, f in enumerate(frames)]

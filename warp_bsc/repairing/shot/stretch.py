@@ -100,7 +100,7 @@ class ShotFrame:
     certified: bool = True
     contacts: Contacts = field(default_factory=Contacts.none)
     arcs: RigidMotion | None = None
-    inner: InnerVertices = InnerVertices()
+    inner: InnerVertices = field(default_factory=InnerVertices)
 
     @staticmethod
     def of_shot(given: np.ndarray, arcs: RigidMotion | None = None) -> "ShotFrame":
@@ -152,7 +152,7 @@ class StretchRecorder:
         self._ratios.append((float(ratio.min(initial=1.0)), float(ratio.max(initial=1.0))))
 
     def finish(self, reasons: list[str], held: tuple[str, ...] = ()) -> RepairedStretch:
-        """Returns the stretch; ``reasons`` say why collisions remain, and ``held`` are as :attr:`RepairedStretch.held`."""
+        """Returns the stretch; ``reasons`` and ``held`` are those of :class:`RepairedStretch`."""
         return RepairedStretch(
             start=self._times[0],
             end=self._times[-1],

@@ -17,6 +17,9 @@ SHAPES = {f"{name}[]": ("f4", 3) for name in ("float3", "point3f", "vector3f", "
 SHAPES |= {"float[]": ("f4", 1), "int[]": ("i4", 1), "int2[]": ("i4", 2)}
 """Type and number of the components of a row, by the type of an attribute."""
 
+AddSample = Callable[[str, str, float | None, np.ndarray], None]
+"""Adds a sample to a layer, see :func:`new_layer`."""
+
 _SAVED = 1 << 25  # bytes of samples that a layer holds in memory before it saves them
 
 
@@ -57,9 +60,7 @@ class LayerPrim:
 
 
 @contextlib.contextmanager
-def new_layer(
-    path: Path, file_format: str
-) -> Iterator[tuple[Any, Callable[[str, str, float | None, np.ndarray], None]]]:
+def new_layer(path: Path, file_format: str) -> Iterator[tuple[Any, AddSample]]:
     """Makes a layer in USD's binary format, in which saved samples leave the memory, and saves it after the block.
 
     Args:
