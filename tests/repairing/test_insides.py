@@ -159,6 +159,20 @@ def test_parts_that_can_follow_do(tmp_path):
     assert np.array_equal(frames[0].x[4:], np.float32(moved[4:]))
 
 
+def test_inner_vertices_make_room(tmp_path):
+    """The middle of the top of a block is pushed below its centre, to which a mean of displacements is not enough."""
+    stage = new_stage(tmp_path / "still.usda")
+    points, tets = block((2, 2, 2), 0.5)
+    add_tets(stage, {0: as_tuples(points), 1: as_tuples(points)}, tets.tolist())
+    (centre,) = inner_vertices(tets)
+    outer = np.delete(points, centre, axis=0)
+    pushed = np.where((outer == [0.5, 0.5, 1.0]).all(axis=1)[:, None], [0.5, 0.5, 0.45], outer)
+    frames, held = insides_of(stage, [pushed])
+    x = np.insert(frames[0].x, centre, frames[0].inner.x[0], axis=0)
+    assert not held and x[centre, 2] < 0.4
+    assert not inverting(x[None].astype(float), tets).any()
+
+
 def test_options(tmp_path):
     """Kept bodies stay, hard ones keep their shape inside as well, larger moves are not made."""
     stage = pressed_bar(tmp_path / "shot.usda", cells=(3, 2, 2))

@@ -9,7 +9,7 @@ from .._atomic_file import STDOUT, unfinished_path
 from ..mesh_files.file_scene import FileScene, FrameFiles
 from ..mesh_files.frames import find_frames, make_folder
 from ..mesh_files.mesh_file import is_mesh_file
-from ..repairing.shot.findings import count_found, kept_meshes, matching_meshes
+from ..repairing.shot.findings import INVERTED, count_found, kept_meshes, matching_meshes
 from ..repairing.shot.report import RepairPage
 from ..scene_replay.hit_files import replay_facts
 from ..usd.scene import Scene
@@ -44,6 +44,8 @@ Where the scene is free, it keeps every bit; a few frames before a collision the
 points leave their places, and return to them after it.
 Meshes that only transforms move, shapes, curves, points and instances keep
 their places, and so do meshes of --keep: the others are kept apart from them.
+The inside of a TetMesh follows its surface; where tetrahedra would invert, it
+stays, and is named. A scene without motion is repaired as one frame.
 Two meshes that cross at the first frame, such as the parts of a body, are
 mostly meant to: they are named, and stay as they are, at all frames.
 Curves and points are not seen. --ignore and --between choose what is looked
@@ -204,7 +206,8 @@ def _run(arguments: argparse.Namespace) -> int:
         print(json.dumps(run.facts(kept, remaining), indent=1))
     else:
         print_repair(Console(), run, kept, remaining)
-    found = {"remaining": any(remaining.values()), "distorted": bool(run.distorted)}
+    repairable = [number for what, number in remaining.items() if what != INVERTED]
+    found = {"remaining": any(repairable), "distorted": bool(run.distorted)}
     if any(found[reason] for reason in arguments.fail_on):
         return ExitStatus.FOUND
     return ExitStatus.LEFT_OUT if scene.left_out or any(stretch.held for stretch in run.stretches) else ExitStatus.DONE

@@ -19,6 +19,9 @@ from ...usd.selection import Selection
 MeshPair = tuple[str, str]
 """Names of two meshes."""
 
+INVERTED = "inverted tetrahedra"
+"""The name of their number, see :func:`count_found`."""
+
 _KEY = np.array([2**31, 1])
 """Makes one number of the numbers of two elements."""
 
@@ -75,7 +78,7 @@ def count_found(findings: list[Finding], min_distance: float) -> dict[str, int]:
             finding.unrepaired_hits for finding in findings
         )
     if any(finding.inverted is not None for finding in findings):
-        counts["inverted tetrahedra"] = sum(finding.inverted or 0 for finding in findings)
+        counts[INVERTED] = sum(finding.inverted or 0 for finding in findings)
     return counts
 
 
@@ -92,7 +95,7 @@ def kept_meshes(scene: Scene, keep: Iterable[str] = ()) -> dict[str, str]:
     """
     kept = dict.fromkeys(matching_meshes(scene, keep, "keep"), "it is to be kept")
     prims = [scene.prim_of(name) for name in scene.names]
-    is_still = not any(prim.times for prim in prims)  # all may be moved then
+    is_still = scene.is_still and not any(prim.times for prim in prims)  # all may be moved then
     reasons = {prim.name: prim.why_not_written if is_still else prim.why_not_repaired for prim in prims}
     return {name: why for name, why in reasons.items() if why} | kept
 
