@@ -1,6 +1,5 @@
 """Moves the inside of tetrahedra with their repaired surfaces, without inverting any that the shot does not invert."""
 
-import itertools
 from collections.abc import Container
 from dataclasses import replace
 from typing import Any
@@ -93,17 +92,16 @@ class Insides:
         """
         share, is_new, in_shot = np.ones((len(frames), len(self._body))), np.ones(len(frames), dtype=bool), {}
         found: dict[int, tuple[ShotFrame, np.ndarray]] = {}
-        for attempt in itertools.count():
+        attempt = 0
+        while is_new.any():
             for k in np.flatnonzero(is_new).tolist():
                 found[k] = self._placed(frames[k], given[k], moments[k], share[k], origin)
             inverts = self._inverting([found[k][1] for k in range(len(frames))], given, in_shot)
-            if not inverts.any():
-                break
             if attempt < _ATTEMPTS:
                 less = self._eased(np.where(inverts, 0.0, share))
             else:
                 less = np.where(np.isin(self._body, self._body[inverts.any(axis=0)]), 0.0, share)
-            is_new, share = (less != share).any(axis=1), less
+            is_new, share, attempt = (less != share).any(axis=1), less, attempt + 1
         is_moved = np.array([frame.x != frame.given for frame in frames]).any(axis=2)
         is_less = (share < 1.0) & (self._vertex >= 0) & is_moved[:, self._vertex]
         are_less = is_less.any(axis=1)
