@@ -74,7 +74,8 @@ examples:
 
 {explain_statuses(ExitStatus.FOUND, ExitStatus.LEFT_OUT, ExitStatus.EMPTY)}"""
 
-_OF_ALL = {"command_line", "scene", "output", "report", "keep", "rigid", "min_distance", "json", "fail_on", "device"}
+_OF_ALL = {"command_line", "scene", "output", "report", "keep", "rigid", "triage", "min_distance", "json"}
+_OF_ALL |= {"fail_on", "device"}
 _OF_ONE_FRAME = {"max_strain", "order", "previous"}
 _OF_FRAMES = {"max_move", "resume"}
 """The options for everything, for mesh files of one frame alone, and for several frames. Others are for USD alone."""
@@ -155,15 +156,16 @@ def _run(arguments: argparse.Namespace) -> int:
     check_page(arguments.report)
     if arguments.output == STDOUT:
         raise ValueError("--output must be a file, not standard output")
+    selection = read_selection(arguments, of_files=bool(frames))
     if frames and kind == "mesh files":
         if "distorted" in arguments.fail_on:
             raise ValueError("--fail-on distorted is for shots; --max-strain bounds the strain of one frame")
-        return repair_files(frames, arguments)
+        return repair_files(frames, arguments, selection)
     device = find_device(arguments.device) if frames else find_devices(arguments.device)[0]
-    chosen = {"selection": read_selection(arguments), "frames": arguments.frames}
+    chosen = {"selection": selection, "frames": arguments.frames}
     if frames:
         outputs = frames.outputs(arguments.keep, arguments.output)
-        scene = read_frames(frames)
+        scene = read_frames(frames, selection)
         arguments.include_initial = True  # all that crosses is repaired, as in files of one frame
     else:
         scene, outputs = _open_usd(arguments, chosen), []
@@ -189,7 +191,7 @@ def _run(arguments: argparse.Namespace) -> int:
         after = run.journal.findings if run.is_whole else None
         if run.is_whole and (frames or run.has_moved):
             if isinstance(layer, FrameFiles):
-                fixed = read_frames(layer.frames)
+                fixed = read_frames(layer.frames, selection)
             else:
                 fixed = read_scene(arguments.output, arguments, **chosen)
             assert run.journal.findings
