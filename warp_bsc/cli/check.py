@@ -97,7 +97,7 @@ def _run(arguments: argparse.Namespace) -> int:
     if arguments.report:
         _report(arguments.report, frames, selection, str(device))
     findings: dict[str, Findings] = {kind: [] for kind in _KINDS if is_motion or kind != "collisions"}
-    named = {name: SimpleNamespace(path=name, name=name) for name in frames.names}
+    named: dict[str, Any] = {name: SimpleNamespace(path=name, name=name) for name in frames.names}
     notes = dict.fromkeys(selection.unmatched([*named.values()]))
     meant, is_meant = Counter(), functools.cache(lambda a, b: selection.meant(named[a], named[b]))
     names = {path: name for paths in frames.paths for path, name in zip(paths, frames.names, strict=True)}

@@ -62,7 +62,7 @@ def repair_files(frames: Frames, arguments: argparse.Namespace, selection: Selec
     kept = np.array([output is None for output in outputs])
     are_rigid = np.array(frames.matching(arguments.rigid, "--rigid"))
     meets = ~(kept & kept[:, None])
-    named = [SimpleNamespace(path=name, name=name) for name in frames.names]
+    named: list[Any] = [SimpleNamespace(path=name, name=name) for name in frames.names]
     meets.flat[selection.ignored_pairs(named, np.argwhere(meets | True))] = False
     mesh = _mesh_of(scene, meets, device)
     pieces = connect_cells(mesh.edges, len(scene.x))

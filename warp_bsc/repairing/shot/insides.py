@@ -13,7 +13,7 @@ from ...usd.scene import Scene
 from ...usd.segment import Segment
 from ...usd.write.points_layer import to_own_space
 from ..elastic import Springs
-from ..surface import Surface
+from ..surface import Surface, differ
 from .stretch import InnerVertices, ShotFrame
 
 Moment = tuple[float, bool]
@@ -128,11 +128,11 @@ class Insides:
                 moved = rows.start + np.flatnonzero(is_moved[rows])
                 x[moved] = to_own_space(prim, world[moved], *moment)
 
-        moved = on_surface & (frame.x != frame.given).any(axis=1)[self._vertex]
+        moved = on_surface & differ(frame.x, frame.given)[self._vertex]
         world[moved] = frame.x[self._vertex[moved]] + origin
         place(moved)
         inside = self._inside(x, given)
-        moved = self._is_inner & (inside != given).any(axis=1)
+        moved = self._is_inner & differ(inside, given)
         for prim, rows in self._parts:
             transform = prim.read_transform(moment[0], before=moment[1])
             world[rows] = inside[rows] @ transform[:3, :3] + transform[3, :3]

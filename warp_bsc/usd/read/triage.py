@@ -19,7 +19,7 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..._arguments import given
+from ..._arguments import checked_flag, given
 from ..._atomic_file import naming
 from ..selection import Meant, Selection
 
@@ -66,11 +66,12 @@ def read_triage(path: str | os.PathLike, *, of_files: bool = False) -> tuple[Mea
 
     Raises:
         OSError: If it cannot be read.
-        TypeError: If the path has another type.
+        TypeError: If an argument has another type.
         ValueError: If it is not a triage file; the message names the entry.
     """
     if not isinstance(path, str | os.PathLike):
         raise TypeError(f"path must be the path of a triage file, not {given(path)}")
+    is_name = checked_flag(of_files, "of_files")
     with naming(path):
         content = Path(path).read_bytes()
     try:
@@ -78,7 +79,7 @@ def read_triage(path: str | os.PathLike, *, of_files: bool = False) -> tuple[Mea
         _check_keys(found, "the file", {"version": int, "meant": list})
         if found["version"] != 1:
             raise ValueError(f"version is {found['version']}, and this version of warp-bsc reads version 1")
-        return tuple(_read_entry(entry, f"meant[{number}]", of_files) for number, entry in enumerate(found["meant"]))
+        return tuple(_read_entry(entry, f"meant[{number}]", is_name) for number, entry in enumerate(found["meant"]))
     except ValueError as error:  # of its encoding, too
         raise ValueError(f"{path}: not a triage file: {error}") from None
 
