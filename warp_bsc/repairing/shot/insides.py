@@ -102,8 +102,8 @@ class Insides:
             else:
                 less = np.where(np.isin(self._body, self._body[inverts.any(axis=0)]), 0.0, share)
             is_new, share, attempt = (less != share).any(axis=1), less, attempt + 1
-        is_moved = np.array([frame.x != frame.given for frame in frames]).any(axis=2)
-        is_less = (share < 1.0) & (self._vertex >= 0) & is_moved[:, self._vertex]
+        is_moved = [differ(frame.x, frame.given)[self._vertex] for frame in frames]
+        is_less: np.ndarray = (share < 1.0) & (self._vertex >= 0) & is_moved
         are_less = is_less.any(axis=1)
         certified = ~(are_less | np.append(False, are_less[:-1]))
         frames = [replace(found[k][0], certified=f.certified and bool(certified[k])) for k, f in enumerate(frames)]
