@@ -104,7 +104,7 @@ class Insides:
             is_new, share, attempt = (less != share).any(axis=1), less, attempt + 1
         is_moved = [differ(frame.x, frame.given)[self._vertex] for frame in frames]
         is_less: np.ndarray = (share < 1.0) & (self._vertex >= 0) & is_moved
-        are_less = is_less.any(axis=1)
+        are_less = np.any(is_less, axis=1)
         certified = ~(are_less | np.append(False, are_less[:-1]))
         frames = [replace(found[k][0], certified=f.certified and bool(certified[k])) for k, f in enumerate(frames)]
         times = np.array([time for time, _ in moments])

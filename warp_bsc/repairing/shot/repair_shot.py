@@ -313,9 +313,8 @@ class _Shot:
         if self._insides is None:
             return frames, ()
         frames = list(frames)
-        numbers = range(first, first + len(frames) - 1)
-        given = [self._scene.interval(first).tet_positions[0]]
-        given += [self._scene.interval(index).tet_positions[1] for index in numbers]
+        starts = [first, *range(first, first + len(frames) - 1)]
+        given = [self._scene.interval(index).tet_positions[number > 0] for number, index in enumerate(starts)]
         moments = [self._moment(first, number) for number in range(len(frames))]
         frames, held = self._insides.follow(frames, given, moments, self._origin)
         if held and self._scene.interval(first).is_at_rest:  # then it does not cross more than it did

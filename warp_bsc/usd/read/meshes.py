@@ -222,6 +222,8 @@ class UsdMesh:
             return "it is in an instance, which shares its points with others"
         if self.is_shape or self.is_strands:
             return f"a {self.type_name} has no faces of its own"
+        if self.has_tetrahedra and self.is_skinned:
+            return "a skeleton or blend shapes deform its tetrahedra"
         return None
 
     @property
