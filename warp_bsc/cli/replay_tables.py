@@ -90,13 +90,13 @@ def print_replay(console: Console, summary: Summary) -> None:
 def print_repair(console: Console, summary: Summary, command: str) -> None:
     """Prints the command that repairs what a replay found; nothing if it found nothing that a repair can move."""
     names = {name for meshes, _ in summary.mesh_pairs for name in meshes}
-    if all(summary.scene.prim_of(name).why_not_repaired for name in names):
+    kept = kept_meshes(summary.scene).keys()
+    if names <= kept:
         return
     say(console, f"To repair: {command}")
     start = summary.intersections[0].mesh_pairs if summary.intersections else {}
     crossing = [pair for pair, (crosses, _) in start.items() if crosses and pair[0] != pair[1]]
-    kept = set(kept_meshes(summary.scene) if crossing else ())
-    if left := [pair for pair in crossing if not kept.issuperset(pair)]:
+    if left := [pair for pair in crossing if not kept >= {*pair}]:
         pairs = count(len(left), "pair")
         say(console, f"  It leaves {pairs} of meshes that cross at the first time; --include-initial repairs them too.")
         closed = closed_meshes(summary.scene)

@@ -125,15 +125,17 @@ class Selection:
         """Whether some pairs of meshes may not be checked, or may be ignored."""
         return bool(self.between or self.ignore or self.triage or self.ignored_names or not self.self_collisions)
 
-    def unmatched(self, meshes: Sequence[NamedMesh]) -> dict[str, list[tuple[str, ...]]]:
-        """Returns what is to be ignored and has a pattern that matches no mesh, by the attribute, given all meshes."""
-        named = {"ignore": self.ignore, "triage": [entry.meshes for entry in self.triage]}
-        return {
-            name: [
+    def unmatched(self, meshes: Sequence[NamedMesh]) -> list[str]:
+        """Returns what is to be ignored and has a pattern that matches no mesh, in words, given all meshes."""
+        texts = []
+        for name, entries in {"ignore": self.ignore, "triage": [entry.meshes for entry in self.triage]}.items():
+            bad = [
                 entry for entry in entries if not all(any(_matches(m, pattern) for m in meshes) for pattern in entry)
             ]
-            for name, entries in named.items()
-        }
+            texts += (
+                [f"{name}: entries that match no meshes: {len(bad)}, the first is {' '.join(bad[0])}"] if bad else []
+            )
+        return texts
 
     def meant(self, first: NamedMesh, second: NamedMesh) -> Meant | None:
         """Returns the first entry of the triage by which two meshes are meant to meet, None without one."""

@@ -19,6 +19,9 @@ from ...usd.selection import Selection
 MeshPair = tuple[str, str]
 """Names of two meshes."""
 
+INVERTED = "inverted tetrahedra"
+"""The name of their number, see :func:`count_found`."""
+
 _KEY = np.array([2**31, 1])
 """Makes one number of the numbers of two elements."""
 
@@ -43,6 +46,7 @@ class Finding:
         unrepaired_hits: Number of pairs that collide of meshes that stay as they are.
         kept_hits: Number of those of meshes that are kept.
         ignored_pairs: Pairs of meshes that collide and are ignored.
+        inverted: Number of tetrahedra that invert or are inverted; None if no mesh has any.
     """
 
     hits: int
@@ -55,6 +59,7 @@ class Finding:
     unrepaired_hits: int = 0
     kept_hits: int = 0
     ignored_pairs: tuple[MeshPair, ...] = ()
+    inverted: int | None = None
 
     @property
     def is_free(self) -> bool:
@@ -72,6 +77,8 @@ def count_found(findings: list[Finding], min_distance: float) -> dict[str, int]:
         counts["collisions of meshes that cross at the first frame"] = sum(
             finding.unrepaired_hits for finding in findings
         )
+    if any(finding.inverted is not None for finding in findings):
+        counts[INVERTED] = sum(finding.inverted or 0 for finding in findings)
     return counts
 
 
@@ -87,8 +94,10 @@ def kept_meshes(scene: Scene, keep: Iterable[str] = ()) -> dict[str, str]:
         ValueError: If a pattern matches no mesh.
     """
     kept = dict.fromkeys(matching_meshes(scene, keep, "keep"), "it is to be kept")
-    reasons = {prim.name: prim.why_not_repaired for prim in map(scene.prim_of, scene.names) if prim.why_not_repaired}
-    return reasons | kept
+    prims = [scene.prim_of(name) for name in scene.names]
+    is_still = scene.is_still and not any(prim.times for prim in prims)  # all may be moved then
+    reasons = {prim.name: prim.why_not_written if is_still else prim.why_not_repaired for prim in prims}
+    return {name: why for name, why in reasons.items() if why} | kept
 
 
 def matching_meshes(scene: Scene, patterns: Iterable[str], what: str) -> list[str]:
@@ -175,6 +184,7 @@ def _find_collisions(results, selection, kept, unrepaired, min_distance, device)
             unrepaired_hits=unrepaired_hits,
             kept_hits=sum(summary.mesh_pairs.values()) - counted - unrepaired_hits,
             ignored_pairs=tuple(summary.ignored),
+            inverted=sum(f.number for f in summary.inverted) if interval.segment.tetrahedra.names else None,
         )
         last = interval.segment
 

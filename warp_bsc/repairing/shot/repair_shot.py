@@ -1,5 +1,6 @@
 """Repairs a shot: its meshes follow it, and leave it where it collides, before and after that as little as needed."""
 
+import itertools
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from typing import Any
@@ -9,9 +10,10 @@ import numpy as np
 from ..._arguments import check_instance, checked_distance, checked_integer
 from ...detection.arcs.rigid_motion import RigidMotion
 from ...detection.at_rest.body_parts import connect_cells
+from ...detection.detector import CollisionDetector
 from ...detection.mesh import CollisionMesh
 from ...scene_replay.scene_arcs import arcs_of
-from ...usd.interval import Interval
+from ...usd.interval import Interval, times_in_words
 from ...usd.scene import Scene
 from ...usd.segment import Segment
 from ...usd.write.points_layer import MovedFrame
@@ -20,6 +22,7 @@ from ..repair import repair
 from .blend import MARGIN, blend
 from .findings import Finding, kept_meshes, matching_meshes
 from .follow import Follower
+from .insides import Insides, Moment
 from .mesh_groups import groups_of
 from .stretch import RepairedStretch, ShotFrame, StretchRecorder
 
@@ -147,16 +150,16 @@ class _Shot:
         used, displacements = _joined(sought, stop - first + 1)
         recorder = self._recorder()
         frame, number = start, 0
-        self._record(recorder, first, start, 0)
         frames = self._follow(first, stop, last, start, contacts, used, blend(displacements))
-        for number, frame in enumerate(self._relaxed(start, frames), 1):
+        frames, held = self._with_insides(first, itertools.chain([start], self._relaxed(start, frames)), reasons)
+        for number, frame in enumerate(frames):
             self._record(recorder, first, frame, number)
         stop = first + number
         is_free = all(finding.is_free for finding in self._findings[max(first, stop - 2 * MARGIN) : stop])
         if is_free and frame.differs:
             time = self._scene.times[stop]
             reasons.append(f"the meshes have not returned to the shot at time {time:g}, where it ends or jumps")
-        stretch = recorder.finish(reasons)
+        stretch = recorder.finish(reasons, held)
         if max_move is not None and stretch.largest_move > max_move:
             reason = f"kept as it is: a move of {stretch.largest_move:g} is needed, more than {max_move:g}"
             recorder = self._recorder()
@@ -199,6 +202,11 @@ class _Shot:
             options: dict[str, Any] = {"rigid": self._rigid, "min_distance": self._min_distance}
             self._follower = Follower(mesh, self._single(x), is_movable, **options)
             self._is_movable = is_movable
+            self._insides = None
+            if any(mesh.name in segment.tetrahedra.points and mesh.name not in self._kept for mesh in segment.meshes):
+                given, _ = self._scene.interval(index).tet_positions
+                options = {"rigid": self._hard, "device": self._device}
+                self._insides = Insides(self._scene, segment, is_movable, given, **options)
         return self._scene.interval(index)
 
     def _single(self, x) -> np.ndarray:
@@ -247,6 +255,9 @@ class _Shot:
             if index >= stop and not frame.differs:
                 break
             interval = self._scene.interval(index)
+            if interval.is_at_rest:  # the first frame, which is repaired by itself
+                yield frame
+                continue
             given, arcs = self._single(interval.x1), self._arcs(interval)
             if displacements is None:
                 displacement = _FADING * frame.displacement
@@ -293,6 +304,35 @@ class _Shot:
                 yield window[0]
         yield from window[1:]
 
+    def _with_insides(self, first, frames, reasons) -> tuple[Iterable[ShotFrame], tuple[str, ...]]:
+        """Returns frames from that at the start of an interval on with what moves inside tetrahedra.
+
+        Returns:
+            The frames, and the meshes of which parts are moved less, which ``reasons`` get as well.
+        """
+        if self._insides is None:
+            return frames, ()
+        frames = list(frames)
+        starts = [first, *range(first, first + len(frames) - 1)]
+        given = [self._scene.interval(index).tet_positions[number > 0] for number, index in enumerate(starts)]
+        moments = [self._moment(first, number) for number in range(len(frames))]
+        frames, held = self._insides.follow(frames, given, moments, self._origin)
+        if held and self._scene.interval(first).is_at_rest:  # then it does not cross more than it did
+            finder, (frame, *_) = CollisionDetector(self._follower.mesh), frames
+            if len(finder.find_intersections(frame.x)) > len(finder.find_intersections(frame.given)):
+                frames = [ShotFrame.of_shot(frame.given)] * len(frames)
+        reasons += [
+            f"{name} is moved less than contacts need {times_in_words(times)}, as its tetrahedra would invert"
+            for name, times in held.items()
+        ]
+        return frames, tuple(held)
+
+    def _moment(self, first, number) -> Moment:
+        """Returns the moment of the frame of a number, counted from that at the start of the first interval."""
+        index = first + number
+        before = number > 0 and index < len(self._findings) and not self._findings[index].is_joined
+        return self._scene.times[index], before
+
     def _recorder(self) -> StretchRecorder:
         return StretchRecorder(self._is_movable, self._follower.edges, self._follower.length)
 
@@ -300,10 +340,9 @@ class _Shot:
         """Adds the frame of a number, counted from that at the start of the first interval, to a stretch."""
         assert self._segment is not None
         (vertices,) = np.nonzero((frame.x != frame.given).any(axis=1))
-        index = first + number
-        before = number > 0 and index < len(self._findings) and not self._findings[index].is_joined
         x = frame.x[vertices].astype(np.float64) + self._origin
-        recorder.add(frame, MovedFrame(self._scene.times[index], before, self._segment, vertices, x))
+        vertices, x = np.append(vertices, len(frame.x) + frame.inner.numbers), np.concatenate([x, frame.inner.x])
+        recorder.add(frame, MovedFrame(*self._moment(first, number), self._segment, vertices, x))
 
 
 def _nonzero(displacement) -> tuple[np.ndarray, np.ndarray]:

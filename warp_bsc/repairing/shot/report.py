@@ -118,7 +118,7 @@ class _Summary:
                 if not self.segments or frame.segment is not self.segments[-1]:
                     self.segments.append(frame.segment)
                     self.moved.append(np.zeros(frame.segment.vertex_count, dtype=bool))
-                self.moved[-1][frame.vertices] = True
+                self.moved[-1][frame.vertices[frame.vertices < frame.segment.vertex_count]] = True
             self._stretches.append(stretch)
 
     def data(

@@ -3,15 +3,13 @@
 import contextlib
 import os
 import secrets
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ..._atomic_file import OutputFile
 from ..scene import Scene
-from .layer_writer import new_layer
+from .layer_writer import AddSample, new_layer
 
 
 def unused_path(scene: Scene, path: str) -> str:
@@ -39,7 +37,7 @@ class SceneLayer:
     @contextlib.contextmanager
     def writing(
         self, file: OutputFile, documentation: str, custom: dict[str, dict[str, Any]], end: float | None = None
-    ) -> Iterator[tuple[Any, Callable[[str, str, float, np.ndarray], None]]]:
+    ) -> Iterator[tuple[Any, AddSample]]:
         """Makes the layer, which the block fills, with results and errors of :func:`new_layer`; then commits the file.
 
         Args:

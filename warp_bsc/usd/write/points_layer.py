@@ -25,7 +25,7 @@ class MovedFrame:
         time: Time code.
         before: Whether the moment just before that time is meant, at which a mesh then jumps or a segment ends.
         segment: The meshes.
-        vertices: The moved vertices, shape [n].
+        vertices: The moved vertices, shape [n]; after those of the segment, the ones of its tetrahedra inside surfaces.
         x: Their positions in world space, float64, shape [n, 3].
     """
 
@@ -37,18 +37,23 @@ class MovedFrame:
 
     def by_mesh(self) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
         """Yields the number of each mesh with moved vertices, these among its prim's points, and their positions."""
-        rows = np.full(self.segment.vertex_count, -1)
+        count, tetrahedra = self.segment.vertex_count, self.segment.tetrahedra
+        rows = np.full(count + tetrahedra.vertex_count, -1)
         rows[self.vertices] = np.arange(len(self.vertices))
         for number, mesh in enumerate(self.segment.meshes):
-            own = rows[self.segment.vertices_of(number)]
+            own, points = rows[self.segment.vertices_of(number)], mesh.points
+            if mesh.name in tetrahedra.points:
+                numbers, inner = tetrahedra.points[mesh.name]
+                own, points = np.append(own, rows[count:][numbers]), np.append(points, inner)
             if (own >= 0).any():
-                yield number, mesh.points[own >= 0], self.x[own[own >= 0]]
+                yield number, points[own >= 0], self.x[own[own >= 0]]
 
 
 class PointsLayer:
     """A layer whose sublayer is the scene, so that opening it shows the scene with the moved points.
 
-    A moved mesh has a sample of its points at each time of the scene and of its own. Points that are not moved have the
+    A moved mesh has a sample of its points at each time of the scene and of its own; one that has no samples has none
+    here either, but other points. Points that are not moved have the
     bits of the scene. Meshes that are not moved at any time have no opinion in the layer. A skeleton or blend shapes no
     longer deform a moved mesh: its points are those that they would give it. Authored normals turn with the surface,
     authored extents are computed again where points move, authored velocities get the velocity of the displacement, and
@@ -84,7 +89,7 @@ class PointsLayer:
         """
         for number, points, positions in frame.by_mesh():
             name = frame.segment.meshes[number].name
-            x = _to_own_space(self._scene.prim_of(name), positions, frame.time, frame.before)
+            x = to_own_space(self._scene.prim_of(name), positions, frame.time, frame.before)
             self._moved.setdefault(name, {})[frame.time, frame.before] = self._moves.tell(), len(points)
             rest = memoryview(points.astype(np.int64).tobytes() + x.tobytes())
             while rest:
@@ -136,7 +141,7 @@ class PointsLayer:
             blocked.default = Sdf.ValueBlock()
         frames = [(*key, *self._points(mesh, *key)) for key in self._times(mesh)]
         for index, (time, before, old, new) in enumerate(frames):
-            code = just_before(time) if before else time
+            code = None if not mesh.times else just_before(time) if before else time
             following = frames[index + 1] if index + 1 < len(frames) else None
             if following is not None and following[0] > time and len(following[2]) == len(old):
                 seconds = (following[0] - time) / self._scene.time_codes_per_second
@@ -183,7 +188,7 @@ class _Surface:
     def __init__(self, mesh: "UsdMesh"):
         from pxr import UsdGeom  # noqa: PLC0415 (slow)
 
-        self._schema = UsdGeom.Mesh(mesh.prim)
+        self._mesh, self._schema = mesh, UsdGeom.Mesh(mesh.prim)
         primvar = UsdGeom.PrimvarsAPI(mesh.prim).GetPrimvar("normals")
         has_primvar = primvar and primvar.HasAuthoredValue() and not primvar.IsIndexed()
         self._normals = primvar.GetAttr() if has_primvar else self._schema.GetNormalsAttr()
@@ -216,8 +221,12 @@ class _Surface:
 
     def _turn(self, normals, old, new, time) -> np.ndarray:
         """Returns authored normals turned with the surface; those of a constant or of another number stay."""
-        counts = np.array(self._schema.GetFaceVertexCountsAttr().Get(time))
-        corners = np.array(self._schema.GetFaceVertexIndicesAttr().Get(time))
+        if self._mesh.has_tetrahedra:
+            corners = self._mesh.read_triangles(time, old)[0].ravel()
+            counts = np.full(len(corners) // 3, 3)
+        else:
+            counts = np.array(self._schema.GetFaceVertexCountsAttr().Get(time))
+            corners = np.array(self._schema.GetFaceVertexIndicesAttr().Get(time))
         (a_faces, a_points), (b_faces, b_points) = (_normals_of(x, counts, corners) for x in (old, new))
         by_interpolation = {
             "vertex": (a_points, b_points),
@@ -245,10 +254,10 @@ def _own_points(mesh: "UsdMesh", time: float, before: bool) -> np.ndarray:
         return points
     transform = mesh.read_transform(time, before=before)
     assert transform is not None  # no instancer places it
-    return _to_own_space(mesh, points @ transform[:3, :3] + transform[3, :3], time, before)
+    return to_own_space(mesh, points @ transform[:3, :3] + transform[3, :3], time, before)
 
 
-def _to_own_space(mesh: "UsdMesh", positions: np.ndarray, time: float, before: bool) -> np.ndarray:
+def to_own_space(mesh: "UsdMesh", positions: np.ndarray, time: float, before: bool) -> np.ndarray:
     """Returns positions in world space at, or just before, a time in the space of a mesh's prim, float32."""
     from pxr import UsdGeom  # noqa: PLC0415 (slow)
 
