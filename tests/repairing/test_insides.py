@@ -124,10 +124,10 @@ def insides_of(stage, frames):
     scene = Scene(save(stage))
     segment = scene.segment(0)
     given = scene.interval(0).tet_positions[0]
-    insides = Insides(scene, segment, np.ones(segment.vertex_count, bool), given, device="cpu")
+    insides = Insides(scene, segment, np.ones(segment.vertex_count, bool), given, np.zeros(3), device="cpu")
     x = segment.start_positions
     frames = [ShotFrame(x, np.float32(frame), np.float32(frame) - x) for frame in frames]
-    return insides.follow(frames, [given] * len(frames), [(0.0, False)] * len(frames), np.zeros(3))
+    return insides.follow(frames, [given] * len(frames), [(0.0, False)] * len(frames))
 
 
 @pytest.mark.parametrize(("cos", "sin", "inverts"), [(1, 0, False), (0.6, 0.8, False), (-1, 0, True)])

@@ -39,21 +39,17 @@ class Insides:
         segment: Segment,
         is_movable: np.ndarray,
         given: np.ndarray,
+        origin: np.ndarray,
         *,
         rigid: Container[str] = (),
         device: Any = None,
     ):
         """Finds the vertices inside surfaces.
 
-        Args:
-            scene: The scene.
-            segment: The segment.
-            is_movable: Whether each vertex of the segment may be moved, bool.
-            given: Positions at some time, float64, shape [n, 3].
-            rigid: Names of meshes whose connected pieces move as a whole.
-            device: Warp device.
+        Positions ``given`` at some time are float64, shape [n, 3]; those of frames are relative to an ``origin`` in
+        world space. Connected pieces of the meshes whose names are in ``rigid`` move as a whole.
         """
-        tetrahedra, count = segment.tetrahedra, len(given)
+        tetrahedra, count, self._origin = segment.tetrahedra, len(given), origin
         self._corners, self._body = tetrahedra.corners, connect_cells(tetrahedra.corners, count)
         self._vertex = np.full(count, -1)  # of the segment; -1 inside surfaces
         self._parts, fixed, group = [], np.ones(count, dtype=bool), np.full(count, -1)
@@ -75,27 +71,19 @@ class Insides:
         self._around = self._corners[self._is_inner[self._corners].any(axis=1)]
 
     def follow(
-        self, frames: list[ShotFrame], given: list[np.ndarray], moments: list[Moment], origin: np.ndarray
+        self, frames: list[ShotFrame], given: list[np.ndarray], moments: list[Moment]
     ) -> tuple[list[ShotFrame], dict[str, list[float]]]:
-        """Returns consecutive frames with what moves inside surfaces, and where it could not follow.
+        """Returns consecutive frames with what moves inside surfaces, and the times of each mesh at which it could not.
 
-        There, tetrahedra that would invert are as in the shot, and surfaces around them move less than contacts need.
-
-        Args:
-            frames: The frames, whose surfaces are repaired.
-            given: Positions in the shot at each, float64, shape [n, 3].
-            moments: The moment of each.
-            origin: The point in world space that the positions of frames are relative to.
-
-        Returns:
-            The frames, and by the name of a mesh the times at which it is moved less.
+        Then, tetrahedra that would invert are as in the shot, and surfaces around them move less than contacts need.
+        ``given`` are the positions in the shot at each frame, float64, shape [n, 3].
         """
         share, is_new, in_shot = np.ones((len(frames), len(self._body))), np.ones(len(frames), dtype=bool), {}
         found: dict[int, tuple[ShotFrame, np.ndarray]] = {}
         attempt = 0
         while is_new.any():
             for k in np.flatnonzero(is_new).tolist():
-                found[k] = self._placed(frames[k], given[k], moments[k], share[k], origin)
+                found[k] = self._placed(frames[k], given[k], moments[k], share[k])
             inverts = self._inverting([found[k][1] for k in range(len(frames))], given, in_shot)
             if attempt < _ATTEMPTS:
                 less = self._eased(np.where(inverts, 0.0, share))
@@ -111,9 +99,7 @@ class Insides:
         held = {prim.name: times[is_less[:, rows].any(axis=1)].tolist() for prim, rows in self._parts}
         return frames, {name: at for name, at in held.items() if at}
 
-    def _placed(
-        self, frame: ShotFrame, given: np.ndarray, moment: Moment, share: np.ndarray, origin: np.ndarray
-    ) -> tuple[ShotFrame, np.ndarray]:
+    def _placed(self, frame: ShotFrame, given: np.ndarray, moment: Moment, share: np.ndarray):
         """Returns a frame with a share of its moves, and the positions that a layer has, float64, shape [n, 3]."""
         on_surface = self._vertex >= 0
         if (share < 1.0).any():
@@ -121,16 +107,14 @@ class Insides:
             np.minimum.at(of_vertex[:, 0], self._vertex[on_surface], share[on_surface].astype(np.float32))
             less = frame.given + of_vertex * (frame.x - frame.given)
             frame = replace(frame, x=np.where(of_vertex < 1.0, less, frame.x))
-        x, world = given.copy(), np.zeros_like(given)
+        x, world = given.copy(), frame.x[self._vertex] + self._origin
 
         def place(is_moved: np.ndarray) -> None:
             for prim, rows in self._parts:
                 moved = rows.start + np.flatnonzero(is_moved[rows])
                 x[moved] = to_own_space(prim, world[moved], *moment)
 
-        moved = on_surface & differ(frame.x, frame.given)[self._vertex]
-        world[moved] = frame.x[self._vertex[moved]] + origin
-        place(moved)
+        place(on_surface & differ(frame.x, frame.given)[self._vertex])
         inside = self._inside(x, given)
         moved = self._is_inner & differ(inside, given)
         for prim, rows in self._parts:
@@ -166,10 +150,7 @@ class Insides:
     def _inverting(self, x: list[np.ndarray], given: list[np.ndarray], in_shot: dict[int, np.ndarray]) -> np.ndarray:
         """Returns the vertices of tetrahedra that invert at frames, or on the way to the next, and not in the shot.
 
-        Args:
-            x: Positions at each frame.
-            given: Those of the shot.
-            in_shot: The tetrahedra that invert in the shot, by the number of the frame; those that are found are added.
+        ``in_shot`` gets the tetrahedra that invert in the shot, by the number of the frame, where others do.
         """
         inverts = np.zeros((len(x), len(self._body)), dtype=bool)
         for start in range(max(1, len(x) - 1)):
