@@ -253,10 +253,8 @@ class _Shot:
             if is_free and not frame.differs and not displacement.any():
                 frame, known = ShotFrame.of_shot(given, arcs), Contacts.none()
             else:
-                options: dict[str, Any] = {
-                    "arcs": arcs,
-                    "free_start": frame.given if is_free and self._is_single else None,
-                }
+                free_start = frame.given if is_free and self._is_single else None
+                options: dict[str, Any] = {"arcs": arcs, "free_start": free_start}
                 if displacements is None:
                     known = self._follower.near(known, frame.x)
                     found = follow(frame.x, given, displacement, tolerance=_SOUGHT, known=known, **options)
