@@ -5,12 +5,11 @@ import contextlib
 import json
 from typing import Any
 
-from .._atomic_file import STDOUT, unfinished_path
+from .._atomic_file import STDOUT, OutputFile, unfinished_path
 from ..mesh_files.file_scene import FileScene, FrameFiles
 from ..mesh_files.frames import find_frames, make_folder
 from ..mesh_files.mesh_file import is_mesh_file
 from ..repairing.shot.findings import INVERTED, count_found, kept_meshes, matching_meshes
-from ..repairing.shot.report import RepairPage
 from ..scene_replay.hit_files import replay_facts
 from ..usd.scene import Scene
 from ..usd.write.points_layer import PointsLayer
@@ -179,7 +178,7 @@ def _run(arguments: argparse.Namespace) -> int:
     with contextlib.ExitStack() as stack:
         page = None
         if arguments.report:
-            page = RepairPage(arguments.report)
+            page = OutputFile(arguments.report)
             stack.callback(page.discard)
         if isinstance(scene, FileScene):
             make_folder(arguments.output)
@@ -216,11 +215,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _open_usd(arguments: argparse.Namespace, chosen: dict[str, Any]) -> Scene:
-    """Opens a USD scene, given the selection and the frames.
-
-    Raises:
-        ValueError: If the options do not fit together, or the file is broken.
-    """
+    """Opens a USD scene, given the selection and the frames."""
     if len(arguments.scene) > 1:
         raise ValueError("only mesh files can be several")
     written = [file for file in (arguments.output, arguments.report) if file]

@@ -21,7 +21,7 @@ from ..mesh_files.mesh_file import MeshFile, MeshScene, is_mesh_file
 from ..repairing.repair import repair
 from ..repairing.results import RepairResult
 from ..repairing.shot.findings import kept_meshes
-from ..repairing.shot.report import RepairPage
+from ..repairing.shot.report import write_page
 from ..repairing.shot.stretch import ShotFrame, StretchRecorder
 from ..usd.selection import Selection
 from ..usd.write.points_layer import MovedFrame
@@ -70,7 +70,7 @@ def repair_files(frames: Frames, arguments: argparse.Namespace, selection: Selec
     with contextlib.ExitStack() as stack:
         files, page = [], None
         if arguments.report:
-            page = RepairPage(arguments.report)
+            page = OutputFile(arguments.report)
             stack.callback(page.discard)
         for output in filter(None, outputs):
             files.append(OutputFile(output))  # fails before anything is repaired
@@ -146,12 +146,12 @@ def repair_files(frames: Frames, arguments: argparse.Namespace, selection: Selec
             say_list(console, lines, "")
         say(console, f"What was written has been read again: {'' if certified else 'not '}certified.")
         if page:
-            say(console, f"Wrote {page.file.path}.")
+            say(console, f"Wrote {page.path}.")
     return ExitStatus.FOUND if arguments.fail_on and any(remaining.values()) else ExitStatus.DONE
 
 
 def _write_page(
-    page: RepairPage,
+    page: OutputFile,
     before: FileScene,
     after: FileScene,
     xs: list[np.ndarray],
@@ -173,8 +173,9 @@ def _write_page(
     moved = MovedFrame(time, False, segment, vertices, x[vertices].astype(np.float64))
     recorder.add(ShotFrame(given, x, x - given, result.certified), moved)
     stretches = [recorder.finish([contour.reason for contour in result.unresolved])]
-    with naming(page.file.name):
-        page.write(
+    with naming(page.name):
+        write_page(
+            page,
             before,
             stretches=lambda: stretches,
             before=find(before, "Finding", arguments, device, ()),
@@ -192,11 +193,7 @@ def in_words(elements: list[dict[str, Any]]) -> str:
 
 
 def _mesh_of(scene: MeshScene, meets: np.ndarray, device: wp.Device) -> CollisionMesh:
-    """Returns the mesh of a scene, given which files may meet which, bool; those that may meet the same are a group.
-
-    Raises:
-        ValueError: If there are more than 32 groups.
-    """
+    """Returns the mesh of a scene, given which files may meet which, bool; those that may meet the same are a group."""
     _, first, number = np.unique(meets, axis=0, return_index=True, return_inverse=True)
     if len(first) > 32:
         raise ValueError(f"--triage makes {len(first)} combinations of files that may meet; at most 32 are possible")

@@ -30,12 +30,7 @@ _RANGES = 4
 
 
 def print_replay(console: Console, summary: Summary) -> None:
-    """Prints whether the scene is broken, by which pairs of meshes, the sums, and a table of the worst intervals.
-
-    Args:
-        console: The terminal or file to print to.
-        summary: The results.
-    """
+    """Prints whether the scene is broken, by which pairs of meshes, the sums, and a table of the worst intervals."""
     scene, intervals = summary.scene, summary.intervals
     say(
         console,
@@ -106,13 +101,7 @@ def print_repair(console: Console, summary: Summary, command: str) -> None:
 
 
 def print_work(console: Console, works: list[Work | None], writing: float) -> None:
-    """Prints the times of the parts of the work.
-
-    Args:
-        console: The terminal or file to print to.
-        works: The work for each interval, None for those of an earlier run.
-        writing: Time to write all of them [s].
-    """
+    """Prints the times of the parts of the work, None for intervals of an earlier run, and of writing [s]."""
     done = [work for work in works if work]
     if len(done) < len(works):
         say(console, f"Taken from an earlier run: {count(len(works) - len(done), 'interval')}.")

@@ -63,15 +63,10 @@ def move_freely(
 ) -> tuple[np.ndarray, Contacts]:
     """Returns positions on the way to a goal that are reached without a collision, and the contacts on the way.
 
-    At first contacts are projected: they slide, and leave a gap. Later each vertex stops before its first contact. If
-    that ends nowhere, contacts slide as long as they get fewer, and all vertices stop before the first one.
-    Pairs that keep the minimum distance at the start keep it.
-
-    Args:
-        surface: The surface.
-        start: Positions, in units, shape [n, 3].
-        goal: Likewise, as rounded to the type of the input.
-        slides: Whether contacts slide at first.
+    All are in units, shape [n, 3], the goal as rounded to the type of the input. At first contacts are projected: they
+    slide, and leave a gap. Later each vertex stops before its first contact. If that ends nowhere, contacts slide as
+    long as they get fewer, and all vertices stop before the first one. Pairs that keep the minimum distance at the
+    start keep it. Without ``slides``, no contact slides.
     """
     near = near_pairs(surface, start)
     for together in (False, True)[: 1 + slides]:
@@ -156,11 +151,7 @@ def contacts_at(surface: Surface, x: np.ndarray, held: np.ndarray) -> Contacts:
 def _contacts(surface: Surface, start: np.ndarray, goal: np.ndarray, near: np.ndarray) -> Contacts:
     """Returns the contacts of a motion between positions in units; pairs at rest stay as they are.
 
-    Args:
-        surface: The surface.
-        start: Positions at the start.
-        goal: Positions at the end.
-        near: Keys of the pairs that do not keep the minimum distance at the start: they must only not touch.
+    ``near`` are the keys of the pairs that do not keep the minimum distance at the start: they must only not touch.
     """
     x0, x1 = surface.detected(start), surface.detected(goal)
     contacts = as_contacts(surface.mesh, surface.detector.detect(x0, x1))

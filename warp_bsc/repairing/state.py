@@ -92,9 +92,8 @@ def repair_state(
     if after is not before:
         assert state.particle_q is not None
         state.particle_q.assign(x[:count])
-    found = describe(surface, before, after, chosen, count)
     return StateRepairResult(
-        **found,
+        **describe(surface, before, after, chosen, count),
         x=x[:count],
         inside_before=len(before.inside),
         inside=surface.particles_inside(after.x),

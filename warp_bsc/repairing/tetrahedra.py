@@ -20,19 +20,15 @@ def find_inverted(surface: Surface, x: np.ndarray) -> np.ndarray:
 def follow_surface(surface: Surface, x: np.ndarray) -> np.ndarray:
     """Returns positions at which the inner vertices of tetrahedra move as those around them move, and none inverts.
 
-    A part with tetrahedra that have inverted, connected by vertices that have moved, is as in the input.
-
-    Args:
-        surface: The surface.
-        x: Positions, in units, shape [n, 3]. Vertices of the surface keep them, unless their part does not.
+    A part with tetrahedra that have inverted, connected by vertices that have moved, is as in the input; other vertices
+    of the surface keep their positions, which are in units, shape [n, 3].
     """
     tetrahedra = surface.tetrahedra
     if not len(tetrahedra):
         return x
     is_inner = np.zeros(len(x), dtype=bool)
     is_inner[tetrahedra] = True
-    is_inner[surface.mesh.vertices] = False
-    is_inner &= ~surface.fixed
+    is_inner[surface.mesh.vertices] = is_inner[surface.fixed] = False
     if is_inner.any():
         moves = np.where(is_inner[:, None], 0.0, x - surface.home)
         spread = Springs(surface, is_inner).spread(moves, ~is_inner, _SWEEPS)

@@ -129,12 +129,10 @@ class Selection:
         """Returns what is to be ignored and has a pattern that matches no mesh, in words, given all meshes."""
         texts = []
         for name, entries in {"ignore": self.ignore, "triage": [entry.meshes for entry in self.triage]}.items():
-            bad = [
+            if bad := [
                 entry for entry in entries if not all(any(_matches(m, pattern) for m in meshes) for pattern in entry)
-            ]
-            texts += (
-                [f"{name}: entries that match no meshes: {len(bad)}, the first is {' '.join(bad[0])}"] if bad else []
-            )
+            ]:
+                texts.append(f"{name}: entries that match no meshes: {len(bad)}, the first is {' '.join(bad[0])}")
         return texts
 
     def meant(self, first: NamedMesh, second: NamedMesh) -> Meant | None:
@@ -197,13 +195,8 @@ def _checked_pairs(values, name) -> tuple[tuple[str, str], ...]:
 def _are_of(patterns: tuple[str, ...], meshes: Sequence[NamedMesh], a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Returns which pairs are of a mesh of the first pattern and one of the second, bool, shape [n].
 
-    With a single pattern they are of two meshes, at least one of which matches it.
-
-    Args:
-        patterns: The patterns, one or two.
-        meshes: The meshes.
-        a: Index of one mesh of each pair, shape [n].
-        b: Index of the other, shape [n].
+    With a single pattern they are of two meshes, at least one of which matches it. ``a`` and ``b`` are the indices of
+    the meshes of the pairs, shape [n].
     """
     first, last = (np.array([_matches(mesh, pattern) for mesh in meshes]) for pattern in (patterns[0], patterns[-1]))
     if len(patterns) == 1:

@@ -15,15 +15,13 @@ from ...usd.interval import Interval
 from ...usd.scene import Scene
 from ...usd.segment import Segment
 from ...usd.selection import Selection
+from ..contacts import keys_of
 
 MeshPair = tuple[str, str]
 """Names of two meshes."""
 
 INVERTED = "inverted tetrahedra"
 """The name of their number, see :func:`count_found`."""
-
-_KEY = np.array([2**31, 1])
-"""Makes one number of the numbers of two elements."""
 
 
 @dataclass(frozen=True)
@@ -74,9 +72,8 @@ def count_found(findings: list[Finding], min_distance: float) -> dict[str, int]:
     if min_distance:
         counts[f"pairs nearer than {min_distance:g}"] = sum(finding.near for finding in findings)
     if findings[0].unrepaired_pairs:
-        counts["collisions of meshes that cross at the first frame"] = sum(
-            finding.unrepaired_hits for finding in findings
-        )
+        number = sum(finding.unrepaired_hits for finding in findings)
+        counts["collisions of meshes that cross at the first frame"] = number
     if any(finding.inverted is not None for finding in findings):
         counts[INVERTED] = sum(finding.inverted or 0 for finding in findings)
     return counts
@@ -164,11 +161,11 @@ def _find_collisions(results, selection, kept, unrepaired, min_distance, device)
         start, end = ({p: n for p, n in at.mesh_pairs.items() if not kept >= {*p}} for at in summary.intersections)
         hits = {pair: number for pair, number in summary.mesh_pairs.items() if not kept >= {*pair}}
         if unrepaired is None:
-            unrepaired = frozenset(_sorted(p) for p, (crosses, _) in start.items() if crosses and p[0] != p[1])
+            unrepaired = frozenset(tuple(sorted(p)) for p, (crosses, _) in start.items() if crosses and p[0] != p[1])
         if last is None and min_distance:
             selection = replace(selection, ignored_names=selection.ignored_names | unrepaired)
             near_pairs = _NearPairs(selection, kept, min_distance, device)
-        is_unrepaired = {pair: _sorted(pair) in unrepaired for pair in (*start, *end, *hits)}
+        is_unrepaired = {pair: tuple(sorted(pair)) in unrepaired for pair in (*start, *end, *hits)}
         is_joined = interval.segment is last and not interval.jumps
         near = near_pairs.find(interval, is_joined) if near_pairs else (0, 0)
         counted, unrepaired_hits = (sum(hits[p] for p in hits if is_unrepaired[p] == which) for which in (False, True))
@@ -187,10 +184,6 @@ def _find_collisions(results, selection, kept, unrepaired, min_distance, device)
             inverted=sum(f.number for f in summary.inverted) if interval.segment.tetrahedra.names else None,
         )
         last = interval.segment
-
-
-def _sorted(pair: MeshPair) -> MeshPair:
-    return min(pair), max(pair)
 
 
 class _NearPairs:
@@ -220,6 +213,4 @@ class _NearPairs:
         """Returns a number for each pair that is too near on the way to some positions, int64."""
         found = self._detector.detect(interval.x0, end)
         (contacts,) = find_contacts([interval], self._mesh, found, self._selection)
-        vertex_face, edge_edge = (pairs.astype(np.int64) @ _KEY for pairs in (found.vertex_face, found.edge_edge))
-        keys = np.concatenate([vertex_face, -1 - edge_edge])[contacts.counted]
-        return keys[~self._is_kept[contacts.meshes].all(axis=1)]
+        return keys_of(found)[contacts.counted][~self._is_kept[contacts.meshes].all(axis=1)]

@@ -66,13 +66,7 @@ class RepairedStretch:
 
 
 class InnerVertices(NamedTuple):
-    """Moved vertices of tetrahedra inside surfaces.
-
-    Attributes:
-        numbers: Their numbers among those of the tetrahedra, shape [n].
-        x: Their positions in world space, float64, shape [n, 3].
-        moves: Distances from the shot, shape [n].
-    """
+    """Moved vertices of tetrahedra inside surfaces: numbers, positions in world space, and distances from the shot."""
 
     numbers: np.ndarray = np.zeros(0, dtype=int)
     x: np.ndarray = np.zeros((0, 3))
@@ -123,7 +117,7 @@ class StretchRecorder:
         self._times: list[float] = []
         self._uncertified: list[float] = []
         self._largest: list[float] = []
-        self._moved, self._sum, self._count = 0, 0.0, 0
+        self._sum = 0.0
         self._ratios: list[tuple[float, float]] = []
         self._last: list[tuple[np.ndarray, np.ndarray]] = []  # displacements and positions of the last two frames
         self._acceleration = 0.0, 0.0
@@ -145,22 +139,22 @@ class StretchRecorder:
         self._frames.append(moved)
         moves = np.linalg.norm(added[moved.vertices[moved.vertices < len(added)]], axis=1)
         moves = np.append(moves, frame.inner.moves)
-        self._moved = max(self._moved, len(moves))
         self._largest.append(float(moves.max()))
-        self._sum, self._count = self._sum + float(moves.sum(dtype=np.float64)), self._count + len(moves)
+        self._sum += float(moves.sum(dtype=np.float64))
         ratio = edge_ratios(frame, self._edges, self._length)
         self._ratios.append((float(ratio.min(initial=1.0)), float(ratio.max(initial=1.0))))
 
     def finish(self, reasons: list[str], held: tuple[str, ...] = ()) -> RepairedStretch:
         """Returns the stretch; ``reasons`` and ``held`` are those of :class:`RepairedStretch`."""
+        counts = [len(frame.vertices) for frame in self._frames]
         return RepairedStretch(
             start=self._times[0],
             end=self._times[-1],
             frames=tuple(self._frames),
             largest_moves=tuple(self._largest),
-            moved=self._moved,
+            moved=max(counts, default=0),
             largest_move=max(self._largest, default=0.0),
-            mean_move=self._sum / max(1, self._count),
+            mean_move=self._sum / max(1, sum(counts)),
             edge_length=self._length,
             edge_ratios=tuple(self._ratios),
             acceleration=(self._acceleration[0], self._acceleration[1]),

@@ -18,11 +18,7 @@ class Tetrahedra:
     """
 
     def __init__(self, usd_meshes: list[Any], time: float):
-        """Reads the tetrahedra.
-
-        Args:
-            usd_meshes: The meshes, see :class:`~warp_bsc.usd.read.meshes.UsdMesh`.
-            time: Time code.
+        """Reads the tetrahedra of meshes, see :class:`~warp_bsc.usd.read.meshes.UsdMesh`, at a time code.
 
         Raises:
             UnreadableError: If a mesh is broken.

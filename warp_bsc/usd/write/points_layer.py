@@ -53,11 +53,10 @@ class PointsLayer:
     """A layer whose sublayer is the scene, so that opening it shows the scene with the moved points.
 
     A moved mesh has a sample of its points at each time of the scene and of its own; one that has no samples has none
-    here either, but other points. Points that are not moved have the
-    bits of the scene. Meshes that are not moved at any time have no opinion in the layer. A skeleton or blend shapes no
-    longer deform a moved mesh: its points are those that they would give it. Authored normals turn with the surface,
-    authored extents are computed again where points move, authored velocities get the velocity of the displacement, and
-    authored accelerations are blocked.
+    here either, but other points. Points that are not moved have the bits of the scene. Meshes that are not moved at
+    any time have no opinion in the layer. A skeleton or blend shapes no longer deform a moved mesh: its points are
+    those that they would give it. Authored normals turn with the surface, authored extents are computed again where
+    points move, authored velocities get the velocity of the displacement, and authored accelerations are blocked.
 
     Attributes:
         file: The file.
@@ -170,11 +169,9 @@ class PointsLayer:
     def _points(self, mesh, time, before) -> tuple[np.ndarray, np.ndarray]:
         """Returns the points of a mesh in the scene and in the layer, shapes [point_count, 3]."""
         old = _own_points(mesh, time, before)
-        moved = self._moved[mesh.name].get((time, before))
-        if moved is None:
+        if (time, before) not in self._moved[mesh.name]:
             return old, old
-        new = old.copy()
-        place, count = moved
+        new, (place, count) = old.copy(), self._moved[mesh.name][time, before]
         self._moves.seek(place)
         points = np.frombuffer(self._moves.read(8 * count), np.int64)
         new[points] = np.frombuffer(self._moves.read(12 * count), np.float32).reshape(-1, 3)
@@ -199,11 +196,8 @@ class _Surface:
     def samples(self, old, new, added, time) -> Iterator[tuple[str, str, np.ndarray]]:
         """Yields names, types and values of the attributes at a time.
 
-        Args:
-            old: Points in the scene, shape [point_count, 3].
-            new: Points in the layer.
-            added: Velocities of the displacement in a unit a second.
-            time: Time code.
+        ``old`` and ``new`` are the points in the scene and in the layer, shape [point_count, 3]; ``added`` are the
+        velocities of the displacement, in a unit a second.
         """
         yield "points", "point3f[]", new
         if self._extent.HasAuthoredValue():
@@ -228,13 +222,9 @@ class _Surface:
             counts = np.array(self._schema.GetFaceVertexCountsAttr().Get(time))
             corners = np.array(self._schema.GetFaceVertexIndicesAttr().Get(time))
         (a_faces, a_points), (b_faces, b_points) = (_normals_of(x, counts, corners) for x in (old, new))
-        by_interpolation = {
-            "vertex": (a_points, b_points),
-            "varying": (a_points, b_points),
-            "uniform": (a_faces, b_faces),
-            "faceVarying": (a_points[corners], b_points[corners]),
-        }
-        a, b = by_interpolation.get(str(self._interpolation), (normals, normals))
+        both = {"uniform": (a_faces, b_faces), "faceVarying": (a_points[corners], b_points[corners])}
+        both |= dict.fromkeys(("vertex", "varying"), (a_points, b_points))
+        a, b = both.get(str(self._interpolation), (normals, normals))
         if len(a) != len(normals):
             return normals
         changed = (a != b).any(axis=1)
