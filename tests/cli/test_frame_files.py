@@ -235,3 +235,47 @@ def test_the_page_of_one_repaired_file(folder, capsys):
     assert [mesh["kept"] for mesh in page.data["meshes"]] == [True, False]
     assert main(["check", "coat.glb", "--report", "b.html", "--device", "cpu"]) == 0
     assert Page((folder / "b.html").read_text()).data["nothing"].startswith("Nothing intersects")
+
+
+def triage_of(*meshes):
+    """A triage file by which files are meant to meet."""
+    entry = {"meshes": meshes, "reason": "sewn on", "who": "ada", "date": "2026-11-29"}
+    with open("meant.json", "w") as file:
+        json.dump({"version": 1, "meant": [entry]}, file)
+    return "--triage", "meant.json", "--device", "cpu"
+
+
+def test_what_is_meant_is_neither_listed_nor_repaired(folder, capsys):
+    """Names are those that the command is given; an entry that matches none is told."""
+    names = ("body.obj", "coat_####.ply")
+    triage = triage_of(*names)
+    assert main(["check", *names, *triage, "--fail-on", "intersections,collisions"]) == 0
+    assert "note: meant: sewn on (ada, 2026-11-29): " in capsys.readouterr().out
+    assert main(["repair", *names, "--output", "free/", *triage, "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert not facts["stretches"] and not any(facts["before"].values())
+    triage = triage_of("body.obj", "cat.ply")
+    assert main(["check", *names, *triage, "--fail-on", "intersections"]) == 1
+    assert "triage: entries that match no meshes: 1, the first is body.obj cat.ply" in capsys.readouterr().out
+
+
+def test_what_is_meant_in_one_frame_is_not_repaired(folder, capsys):
+    """Of two balls that cross the body, the one that is not meant to leaves it, also with the other one kept."""
+    SHEET.copy().apply_translation([0.4, 0.0, -0.2]).export("right.obj", digits=17)
+    SHEET.copy().apply_translation([-0.9, 0.0, -0.3]).export("left.obj", digits=17)
+    files, triage = ["body.obj", "left.obj", "right.obj"], triage_of("left.obj", "body.obj")
+    for keep in ((), ("--keep", "left.obj")):
+        assert main(["repair", *files, "--output", "free/", *keep, *triage, "--json"]) == 0
+        facts = json.loads(capsys.readouterr().out)
+        assert facts["before"]["intersections"] and facts["certified"]
+        assert all(bool(row["moved"]) == (row["file"] != "left.obj") for row in facts["files"])
+        fixed = ["free/body.obj", "left.obj", "free/right.obj"]
+        x = [MeshFile(path) for path in fixed]
+        counts = [len(file.x) for file in x]
+        faces = np.concatenate([file.faces + shift for file, shift in zip(x, [0, *np.cumsum(counts)], strict=False)])
+        mesh = bsc.CollisionMesh(faces, sum(counts), device="cpu")
+        found = bsc.CollisionDetector(mesh).find_intersections(np.concatenate([file.x for file in x]))
+        file_of = np.repeat([0, 1, 2], counts)
+        ends = file_of[mesh.edges[found[:, 0], 0]], file_of[faces[found[:, 1], 0]]
+        pairs = {frozenset(pair) for pair in zip(*ends, strict=True)}
+        assert pairs == {frozenset({0, 1})}

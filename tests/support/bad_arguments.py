@@ -449,7 +449,7 @@ def calls_of_scenes() -> dict[str, Call]:
         "read_triage": Call(
             bsc.read_triage,
             {"path": triage},
-            {"path": {"None": None, "number": 3.0, "list": [triage]}},
+            {"path": {"None": None, "number": 3.0, "list": [triage]}, "of_files": {"None": None, "text": "yes"}},
         ),
         "Scene": Call(
             bsc.Scene,

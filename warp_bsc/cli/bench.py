@@ -44,21 +44,13 @@ _JSON: Options = {
 
 @dataclass(frozen=True)
 class _Benchmark:
-    """A command.
+    """A command."""
 
-    Attributes:
-        summary: A line in the list of benchmarks.
-        texts: The module that has its help texts.
-        run: Runs it with the parsed arguments.
-        options: The options.
-        kept: What a signal leaves, in the plural; empty if it leaves nothing.
-    """
-
-    summary: str
-    texts: ModuleType
+    summary: str  # in the list of benchmarks
+    texts: ModuleType  # which has its help texts
     run: Callable[[argparse.Namespace], None]
     options: Options
-    kept: str = ""
+    kept: str = ""  # by a signal, in the plural; empty if it keeps nothing
 
 
 def add_to(commands: Commands, summary: str, named: list[str] | None = None) -> None:

@@ -99,28 +99,17 @@ def _report(
     what: str = "runs",
     **settings: Any,
 ) -> None:
-    """Measures all runs, prints them, and writes those that were complete if an interrupt ends it.
+    """Measures all runs, prints them, and writes those that were complete if an interrupt ends it, then raises it.
 
-    Args:
-        arguments: The options.
-        device: The Warp device.
-        measured: Measures a run when its next element is taken.
-        module: Has ``to_dict``, which makes plain data of runs, and ``show``, which makes tables and lines of that.
-        name: Name of the benchmark in JSON.
-        what: What runs are called.
-        settings: Further arguments of ``to_dict``.
-
-    Raises:
-        OSError: If the file of --json cannot be written.
-        KeyboardInterrupt: If an interrupt ended the measurement, after its results are written.
+    A run is measured when the next element of ``measured`` is taken. ``to_dict`` of the module makes plain data of runs
+    and further settings, and ``show`` makes tables and lines of that.
     """
     with _open_json(arguments.json) as write:
         runs: list[_Run] = []
         interrupt = None
         try:
             with contextlib.closing(measured):  # takes its bar away
-                for run in measured:
-                    runs.append(run)
+                runs.extend(measured)
         except KeyboardInterrupt as signal:
             interrupt = signal
         with INTERRUPTS.held():
@@ -145,15 +134,9 @@ def _measure_each(
 ) -> Generator[_Run, None, None]:
     """Yields runs, and shows the progress.
 
-    Args:
-        cases: The arguments of each run.
-        measure: Measures a run, given these and ``progress``, a function to call with how much of it is done, and how
-            much there is.
-        device: The Warp device.
-        title: Returns the title of a run, given its arguments.
-        unit: What a run is done in; shares without.
-        holds: Whether interrupts wait for the next progress: a library that is interrupted while it loads raises other
-            errors, or none.
+    A run is measured given the arguments of its case, as is its title, and ``progress``, a function to call with how
+    much of it is done, and how much there is, in ``unit``, or shares without. If ``holds``, interrupts wait for the
+    next progress: a library that is interrupted while it loads raises other errors, or none.
     """
     cases = list(cases)
     with RunProgress("Measuring") as progress, loading_kernels(device, progress.console):
@@ -184,11 +167,9 @@ def run_paper(arguments: argparse.Namespace) -> None:
     _check_json(arguments.json, scenes_of_detector.is_scene_name, "a scene", "scenes")
     effort = paper.QUICK if arguments.quick else paper.FULL
     needs_assets = not arguments.scenes or any(name in scenes_of_detector.PAPER_SCENES for name in arguments.scenes)
-    known = (
-        dict(zip(scenes_of_detector.PAPER_SCENES, scenes_of_detector.paper_scenes(), strict=True))
-        if needs_assets
-        else {}
-    )
+    known = {}
+    if needs_assets:
+        known = dict(zip(scenes_of_detector.PAPER_SCENES, scenes_of_detector.paper_scenes(), strict=True))
     names = [known.get(name, name) for name in arguments.scenes or known]
     devices = [find_device(arguments.device)]
     if arguments.device is None:

@@ -1,7 +1,10 @@
 """The command ``warp-bsc check``: finds what crosses, touches or is not sound in mesh files."""
 
 import argparse
+import functools
 import json
+from collections import Counter
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,6 +21,8 @@ from ..repairing.surface import weld_borders, welded
 from ..scene_replay.depths import DepthRecorder
 from ..scene_replay.html_report import ReportPage
 from ..scene_replay.summary import Summary
+from ..usd.read.triage import read_triage
+from ..usd.selection import Selection
 from .device import find_device, loading_kernels
 from .exit_status import ExitStatus, explain_statuses
 from .options import DEVICE, JSON, Commands, add_command, add_fail_on, add_options, file_option, several
@@ -58,7 +63,10 @@ _KINDS = {
     "borders": "edges of one face",
 }
 
-_OF_POSITIONS = ("intersections", "touching", "inside", "degenerate")
+_OF_PAIRS = ("collisions", "intersections", "touching")
+"""The kinds of pairs of elements, which may be meant."""
+
+_OF_POSITIONS = ("collisions", "intersections", "touching", "inside", "degenerate")
 """The kinds that are told of each frame; the others, such as seams, only of the frame from which on they are there."""
 
 _COLUMNS = (
@@ -75,7 +83,8 @@ def add_to(commands: Commands, summary: str) -> None:
     command = add_command(commands, "check", _run, summary=summary, description=_DESCRIPTION, epilog=_EPILOG)
     files = several("FILE", "a mesh file; # stands for a digit of the number of a frame", nargs="+")
     page = file_option("a page with a timeline, every frame in 3D, and a table of what crosses or collides, .html")
-    add_options(command, {"files": files, "--report": page, **JSON, **DEVICE})
+    triage = file_option("do not list what a file says is meant to meet, only count it, as replay does")
+    add_options(command, {"files": files, "--report": page, "--triage": triage, **JSON, **DEVICE})
     add_fail_on(command, _KINDS)
 
 
@@ -84,10 +93,14 @@ def _run(arguments: argparse.Namespace) -> int:
     frames = _with_motion(find_frames(arguments.files))
     is_motion = len(frames.numbers) > 1
     device = find_device(arguments.device)
+    selection = Selection(triage=read_triage(arguments.triage, of_files=True) if arguments.triage else ())
     if arguments.report:
-        _report(arguments.report, frames, str(device))
+        _report(arguments.report, frames, selection, str(device))
     findings: dict[str, Findings] = {kind: [] for kind in _KINDS if is_motion or kind != "collisions"}
-    notes: dict[str, None] = {}
+    named: dict[str, Any] = {name: SimpleNamespace(path=name, name=name) for name in frames.names}
+    notes = dict.fromkeys(selection.unmatched([*named.values()]))
+    meant, is_meant = Counter(), functools.cache(lambda a, b: selection.meant(named[a], named[b]))
+    names = {path: name for paths in frames.paths for path, name in zip(paths, frames.names, strict=True)}
     last, known = None, set()
     with RunProgress("Checking") as progress, loading_kernels(device, progress.console):
         for done, paths in enumerate(frames.paths):
@@ -95,19 +108,23 @@ def _run(arguments: argparse.Namespace) -> int:
             scene = MeshScene(paths)
             notes |= dict.fromkeys(f"{file.path}: {note}" for file in scene.files for note in file.notes)
             has_motion = last is not None and np.array_equal(last.faces, scene.faces)
+            found_here = _find(scene, device)
             if last is not None and has_motion:
-                findings["collisions"] += _find_in_motion(last, scene, device)
+                found_here["collisions"] = _find_in_motion(last, scene, device)
             elif last is not None:
                 notes[f"{', '.join(paths)}: other faces than in the frame before, so no motion is checked"] = None
-            names = dict(zip(paths, frames.names, strict=True))
             before, known = known if has_motion else set(), set()
-            for kind, found in _find(scene, device).items():
+            for kind, found in found_here.items():
                 for elements in found:
+                    if kind in _OF_PAIRS and (entry := is_meant(*(names[element["of"]] for element in elements))):
+                        meant[entry] += 1
+                        continue
                     key = kind, *((names[element["of"]], str(next(iter(element.values())))) for element in elements)
                     known.add(key)
                     if kind in _OF_POSITIONS or key not in before:
                         findings[kind].append(elements)
             last = scene
+    notes |= {f"meant: {entry}: {number:,}, not counted": None for entry, number in meant.items()}
     if arguments.json:
         facts = {"device": str(device), "is_motion": is_motion, "frames": frames.numbers}
         print(json.dumps(facts | {"findings": findings, "notes": list(notes)}, indent=1))
@@ -135,9 +152,9 @@ def _with_motion(frames: Frames) -> Frames:
     return Frames([", ".join(frames.names)], [0, 1], [[path] for path in frames.paths[0]])
 
 
-def _report(path: str, frames: Frames, device: str) -> None:
+def _report(path: str, frames: Frames, selection: Selection, device: str) -> None:
     """Writes the page of a replay of the files."""
-    scene = read_frames(frames)
+    scene = read_frames(frames, selection)
     page, intervals, depths = ReportPage(path, scene=scene), [], DepthRecorder()
     try:
         with naming(path):

@@ -22,7 +22,7 @@ _TEXTS = {
     ExitStatus.ERROR: "wrong usage, bad input or another error; a line on standard error names it and its place",
     ExitStatus.DISAGREES: "replay --validate found a wrong decision",
     ExitStatus.LEFT_OUT: "done, but parts of the scene that may hold geometry could not be read and were left out; "
-    "--strict ends with 2 instead; or repair does not move tetrahedra that deform, and are not of --keep",
+    "--strict ends with 2 instead; or repair moves tetrahedra less than contacts need, as they would invert",
     ExitStatus.EMPTY: "a scene can be read, and has no visible mesh, or none that is selected",
     ExitStatus.BROKEN_PIPE: "the reader of the output, such as head -1, has closed it",
 }

@@ -26,13 +26,10 @@ class _Interrupts:
 
     Ignored signals, as under ``nohup``, stay ignored. Only in the main thread, where Python runs signal handlers, are
     signals handled.
-
-    Attributes:
-        came: The first signal that has arrived, None without one.
     """
 
     def __init__(self):
-        self.came: Interrupted | None = None
+        self.came: Interrupted | None = None  # the first signal that has arrived
         self._handlers: dict[int, Any] = {}
         self._raises = False
 

@@ -5,14 +5,12 @@ import contextlib
 import json
 from typing import Any
 
-from .._atomic_file import STDOUT, unfinished_path
+from .._atomic_file import STDOUT, OutputFile, unfinished_path
 from ..mesh_files.file_scene import FileScene, FrameFiles
 from ..mesh_files.frames import find_frames, make_folder
 from ..mesh_files.mesh_file import is_mesh_file
-from ..repairing.shot.findings import count_found, kept_meshes, matching_meshes
-from ..repairing.shot.report import RepairPage
+from ..repairing.shot.findings import INVERTED, count_found, kept_meshes, matching_meshes
 from ..scene_replay.hit_files import replay_facts
-from ..usd.read.tetrahedra import NOT_REPAIRED
 from ..usd.scene import Scene
 from ..usd.write.points_layer import PointsLayer
 from .device import find_device, find_devices, load_detector, loading_kernels
@@ -45,6 +43,8 @@ Where the scene is free, it keeps every bit; a few frames before a collision the
 points leave their places, and return to them after it.
 Meshes that only transforms move, shapes, curves, points and instances keep
 their places, and so do meshes of --keep: the others are kept apart from them.
+The inside of a TetMesh follows its surface; where tetrahedra would invert, it
+stays, and is named. A scene without motion is repaired as one frame.
 Two meshes that cross at the first frame, such as the parts of a body, are
 mostly meant to: they are named, and stay as they are, at all frames.
 Curves and points are not seen. --ignore and --between choose what is looked
@@ -73,7 +73,8 @@ examples:
 
 {explain_statuses(ExitStatus.FOUND, ExitStatus.LEFT_OUT, ExitStatus.EMPTY)}"""
 
-_OF_ALL = {"command_line", "scene", "output", "report", "keep", "rigid", "min_distance", "json", "fail_on", "device"}
+_OF_ALL = {"command_line", "scene", "output", "report", "keep", "rigid", "triage", "min_distance", "json"}
+_OF_ALL |= {"fail_on", "device"}
 _OF_ONE_FRAME = {"max_strain", "order", "previous"}
 _OF_FRAMES = {"max_move", "resume"}
 """The options for everything, for mesh files of one frame alone, and for several frames. Others are for USD alone."""
@@ -154,15 +155,16 @@ def _run(arguments: argparse.Namespace) -> int:
     check_page(arguments.report)
     if arguments.output == STDOUT:
         raise ValueError("--output must be a file, not standard output")
+    selection = read_selection(arguments, of_files=bool(frames))
     if frames and kind == "mesh files":
         if "distorted" in arguments.fail_on:
             raise ValueError("--fail-on distorted is for shots; --max-strain bounds the strain of one frame")
-        return repair_files(frames, arguments)
+        return repair_files(frames, arguments, selection)
     device = find_device(arguments.device) if frames else find_devices(arguments.device)[0]
-    chosen = {"selection": read_selection(arguments), "frames": arguments.frames}
+    chosen = {"selection": selection, "frames": arguments.frames}
     if frames:
         outputs = frames.outputs(arguments.keep, arguments.output)
-        scene = read_frames(frames)
+        scene = read_frames(frames, selection)
         arguments.include_initial = True  # all that crosses is repaired, as in files of one frame
     else:
         scene, outputs = _open_usd(arguments, chosen), []
@@ -176,7 +178,7 @@ def _run(arguments: argparse.Namespace) -> int:
     with contextlib.ExitStack() as stack:
         page = None
         if arguments.report:
-            page = RepairPage(arguments.report)
+            page = OutputFile(arguments.report)
             stack.callback(page.discard)
         if isinstance(scene, FileScene):
             make_folder(arguments.output)
@@ -188,7 +190,7 @@ def _run(arguments: argparse.Namespace) -> int:
         after = run.journal.findings if run.is_whole else None
         if run.is_whole and (frames or run.has_moved):
             if isinstance(layer, FrameFiles):
-                fixed = read_frames(layer.frames)
+                fixed = read_frames(layer.frames, selection)
             else:
                 fixed = read_scene(arguments.output, arguments, **chosen)
             assert run.journal.findings
@@ -205,18 +207,15 @@ def _run(arguments: argparse.Namespace) -> int:
         print(json.dumps(run.facts(kept, remaining), indent=1))
     else:
         print_repair(Console(), run, kept, remaining)
-    found = {"remaining": any(remaining.values()), "distorted": bool(run.distorted)}
+    repairable = [number for what, number in remaining.items() if what != INVERTED]
+    found = {"remaining": any(repairable), "distorted": bool(run.distorted)}
     if any(found[reason] for reason in arguments.fail_on):
         return ExitStatus.FOUND
-    return ExitStatus.LEFT_OUT if scene.left_out or NOT_REPAIRED in kept.values() else ExitStatus.DONE
+    return ExitStatus.LEFT_OUT if scene.left_out or any(stretch.held for stretch in run.stretches) else ExitStatus.DONE
 
 
 def _open_usd(arguments: argparse.Namespace, chosen: dict[str, Any]) -> Scene:
-    """Opens a USD scene, given the selection and the frames.
-
-    Raises:
-        ValueError: If the options do not fit together, or the file is broken.
-    """
+    """Opens a USD scene, given the selection and the frames."""
     if len(arguments.scene) > 1:
         raise ValueError("only mesh files can be several")
     written = [file for file in (arguments.output, arguments.report) if file]

@@ -4,6 +4,7 @@ import argparse
 import contextlib
 import itertools
 import json
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,8 +21,9 @@ from ..mesh_files.mesh_file import MeshFile, MeshScene, is_mesh_file
 from ..repairing.repair import repair
 from ..repairing.results import RepairResult
 from ..repairing.shot.findings import kept_meshes
-from ..repairing.shot.report import RepairPage
+from ..repairing.shot.report import write_page
 from ..repairing.shot.stretch import ShotFrame, StretchRecorder
+from ..usd.selection import Selection
 from ..usd.write.points_layer import MovedFrame
 from .device import find_device, loading_kernels
 from .exit_status import ExitStatus
@@ -43,13 +45,13 @@ def check_page(path: str | None) -> None:
         raise ValueError(f"--report must be a file of its own, .html, not {what}")
 
 
-def read_frames(frames: Frames) -> FileScene:
+def read_frames(frames: Frames, selection: Selection) -> FileScene:
     """Returns mesh files by frame as a scene, and shows how many have been read."""
     with RunProgress("Reading") as progress:
-        return FileScene(frames, progress.show)
+        return FileScene(frames, progress.show, selection=selection)
 
 
-def repair_files(frames: Frames, arguments: argparse.Namespace) -> int:
+def repair_files(frames: Frames, arguments: argparse.Namespace, selection: Selection) -> int:
     """Runs the command for mesh files of one frame, and returns the exit status."""
     scene = MeshScene(frames.paths[0])
     (outputs,) = frames.outputs(arguments.keep, arguments.output, arguments.previous)
@@ -59,13 +61,16 @@ def repair_files(frames: Frames, arguments: argparse.Namespace) -> int:
         raise ValueError("--previous: the files must have the faces of the scene")
     kept = np.array([output is None for output in outputs])
     are_rigid = np.array(frames.matching(arguments.rigid, "--rigid"))
-    mesh = _mesh_of(scene, kept, device)
+    meets = ~(kept & kept[:, None])
+    named: list[Any] = [SimpleNamespace(path=name, name=name) for name in frames.names]
+    meets.flat[selection.ignored_pairs(named, np.argwhere(meets | True))] = False
+    mesh = _mesh_of(scene, meets, device)
     pieces = connect_cells(mesh.edges, len(scene.x))
     make_folder(arguments.output)
     with contextlib.ExitStack() as stack:
         files, page = [], None
         if arguments.report:
-            page = RepairPage(arguments.report)
+            page = OutputFile(arguments.report)
             stack.callback(page.discard)
         for output in filter(None, outputs):
             files.append(OutputFile(output))  # fails before anything is repaired
@@ -89,12 +94,13 @@ def repair_files(frames: Frames, arguments: argparse.Namespace) -> int:
             file.commit()
         paths = [output or file.path for file, output in zip(scene.files, outputs, strict=True)]
         if page:
-            _write_page(page, read_frames(frames), read_frames(frames._replace(paths=[paths])), xs, result, arguments)
+            before, after = (read_frames(f, selection) for f in (frames, frames._replace(paths=[paths])))
+            _write_page(page, before, after, xs, result, arguments)
     written = MeshScene(paths)
     with np.errstate(over="ignore"):
         rounded = written.x.astype(np.float32)
     positions = [written.x, rounded] if np.isfinite(rounded).all() else [written.x]
-    again = _mesh_of(written, kept, device)
+    again = _mesh_of(written, meets, device)
     meeting = [len(find_meeting(again, x)[1].pairs) for x in positions]
     among_kept = CollisionMesh(scene.faces[kept[scene.file_of[scene.faces[:, 0]]]], len(scene.x), device=device)
     found, remaining = {"intersections": result.crossings_before}, {"intersections": meeting[0]}
@@ -104,6 +110,7 @@ def repair_files(frames: Frames, arguments: argparse.Namespace) -> int:
     notes = [f"{file.path}: {note}" for file in scene.files for note in file.notes]
     if unseen := len(find_meeting(among_kept, scene.x)[1].pairs):
         notes.append(f"in and among obstacles, {unseen:,} edges meet faces; they do not count")
+    notes += selection.unmatched(named)
     if result.order is not None:
         sheets = [np.unique(scene.file_of[result.order == number]) for number in range(result.order.max() + 1)]
         names = ", ".join(scene.files[number].path for number in np.concatenate(sheets))
@@ -139,12 +146,12 @@ def repair_files(frames: Frames, arguments: argparse.Namespace) -> int:
             say_list(console, lines, "")
         say(console, f"What was written has been read again: {'' if certified else 'not '}certified.")
         if page:
-            say(console, f"Wrote {page.file.path}.")
+            say(console, f"Wrote {page.path}.")
     return ExitStatus.FOUND if arguments.fail_on and any(remaining.values()) else ExitStatus.DONE
 
 
 def _write_page(
-    page: RepairPage,
+    page: OutputFile,
     before: FileScene,
     after: FileScene,
     xs: list[np.ndarray],
@@ -166,8 +173,9 @@ def _write_page(
     moved = MovedFrame(time, False, segment, vertices, x[vertices].astype(np.float64))
     recorder.add(ShotFrame(given, x, x - given, result.certified), moved)
     stretches = [recorder.finish([contour.reason for contour in result.unresolved])]
-    with naming(page.file.name):
-        page.write(
+    with naming(page.name):
+        write_page(
+            page,
             before,
             stretches=lambda: stretches,
             before=find(before, "Finding", arguments, device, ()),
@@ -184,7 +192,11 @@ def in_words(elements: list[dict[str, Any]]) -> str:
     return ", ".join(f"{kind} {number} of {path}" for kind, path, number in numbers) + f", at {place}"
 
 
-def _mesh_of(scene: MeshScene, kept: np.ndarray, device: wp.Device) -> CollisionMesh:
-    """Returns the mesh of a scene, in which files that are kept do not meet each other or themselves."""
-    is_kept = kept[scene.file_of].astype(int)
-    return CollisionMesh(scene.faces, len(scene.x), group=1 + is_kept, mask=3 - 2 * is_kept, device=device)
+def _mesh_of(scene: MeshScene, meets: np.ndarray, device: wp.Device) -> CollisionMesh:
+    """Returns the mesh of a scene, given which files may meet which, bool; those that may meet the same are a group."""
+    _, first, number = np.unique(meets, axis=0, return_index=True, return_inverse=True)
+    if len(first) > 32:
+        raise ValueError(f"--triage makes {len(first)} combinations of files that may meet; at most 32 are possible")
+    bits = np.uint32(1) << np.arange(len(first), dtype=np.uint32)
+    of_vertex, masks = number.reshape(-1)[scene.file_of], (meets[first][:, first] * bits).sum(axis=1, dtype=np.uint32)
+    return CollisionMesh(scene.faces, len(scene.x), group=bits[of_vertex], mask=masks[of_vertex], device=device)

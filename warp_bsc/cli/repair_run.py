@@ -8,12 +8,12 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from .._atomic_file import naming, unfinished_path
+from .._atomic_file import OutputFile, naming, unfinished_path
 from ..mesh_files.file_scene import FrameFiles
 from ..repairing.shot.findings import Finding, MeshPair, count_found, find_collisions
 from ..repairing.shot.journal import Journal
 from ..repairing.shot.repair_shot import repair_shot
-from ..repairing.shot.report import RepairPage
+from ..repairing.shot.report import write_page
 from ..repairing.shot.stretch import RepairedStretch
 from ..scene_replay.intervals import replay
 from ..scene_replay.results import IntervalResult
@@ -32,7 +32,6 @@ class RepairRun:
         scene: The scene.
         journal: The findings, and the stretches with their frames, also those of an earlier run.
         found: Numbers of what was found before, by its name.
-        initially_near: Number of pairs that are nearer than the minimum distance from the start.
         unrepaired_pairs: Pairs of meshes that stay as they are.
         stretches: The stretches, without their frames.
         frames: Times and numbers of moved vertices of the moved frames, by stretch.
@@ -54,24 +53,14 @@ class RepairRun:
         device: str,
         facts: dict[str, Any],
     ):
-        """Opens the files.
-
-        Args:
-            scene: The scene.
-            layer: What is written.
-            arguments: The options.
-            device: Name of the Warp device.
-            facts: Scene and options, which must be the same in a run that resumes this one.
-        """
-        self.scene, self._arguments, self._device = scene, arguments, device
-        self._layer = layer
+        """Opens the files. The facts, scene and options, must be the same in a run that resumes this one."""
+        self.scene, self._layer, self._arguments, self._device = scene, layer, arguments, device
         try:
             self.journal = Journal(unfinished_path(arguments.output), facts, resume=arguments.resume)
         except BaseException:
             self._layer.discard()
             raise
         self.found: dict[str, int] = {}
-        self.initially_near = 0
         self.unrepaired_pairs: tuple[MeshPair, ...] = ()
         self.stretches: list[RepairedStretch] = []
         self.frames: list[list[tuple[float, int]]] = []
@@ -88,6 +77,10 @@ class RepairRun:
     def is_whole(self) -> bool:
         """Whether neither a signal nor an error has stopped it."""
         return not self.interrupt and not self.problems
+
+    @property
+    def _stopped(self) -> str:
+        return str(self.interrupt or "") or "; ".join(self.problems)
 
     @property
     def has_moved(self) -> bool:
@@ -131,12 +124,11 @@ class RepairRun:
             self._keep(lambda: journal.begin(findings))
         assert journal.findings is not None
         self.found = count_found(journal.findings, arguments.min_distance)
-        self.initially_near = sum(finding.initially_near for finding in journal.findings)
         self.unrepaired_pairs = journal.findings[0].unrepaired_pairs
-        if self.initially_near:
+        if near := sum(finding.initially_near for finding in journal.findings):
             self.notes.append(
-                f"pairs that are nearer than {arguments.min_distance:g} from the start: {self.initially_near:,}, which "
-                "are not counted; where the scene is repaired, they come no nearer"
+                f"pairs that are nearer than {arguments.min_distance:g} from the start: {near:,}, which are not "
+                "counted; where the scene is repaired, they come no nearer"
             )
         if kept_hits := sum(finding.kept_hits for finding in journal.findings):
             self.notes.append(f"collisions of meshes that are not moved with each other: {kept_hits:,}, not counted")
@@ -196,45 +188,44 @@ class RepairRun:
         facts = self.found | {"stretches": len(self.stretches)}
 
         def finish(layer: PointsLayer | FrameFiles, shortage: str) -> None:
-            stopped = shortage or str(self.interrupt or "") or "; ".join(self.problems)
+            stopped = shortage or self._stopped
             layer.finish(facts | ({"stopped": stopped} if stopped else {}))
 
         self.problems += finish_outputs({self._arguments.output: self._layer}, finish)
 
-    def report(self, page: RepairPage, kept: dict[str, str], after: list[Finding] | None) -> None:
+    def report(self, page: OutputFile, kept: dict[str, str], after: list[Finding] | None) -> None:
         """Writes the page of what is done; ``after`` is what a replay finds in the layer, None if it was not replayed.
 
         Without space on the disk there is no page, and a problem says so.
         """
         assert self.journal.findings is not None
-        stopped = str(self.interrupt or "") or "; ".join(self.problems)
         try:
             if self.stretches and not self.journal.is_open:
                 raise OSError(f"it needs {self.journal.path}, which could not be written")
-            with naming(page.file.name):
-                page.write(
+            with naming(page.name):
+                write_page(
+                    page,
                     self.scene,
                     stretches=lambda: self.journal.stretches(self.scene),
                     before=self.journal.findings,
                     after=after,
                     kept=kept,
                     min_distance=self._arguments.min_distance,
-                    stopped=stopped,
+                    stopped=self._stopped,
                 )
-            self.page = page.file.path
+            self.page = page.path
         except Exception as error:
-            self.problems.append(f"{page.file.name}: not written: {describe(error)}")
+            self.problems.append(f"{page.name}: not written: {describe(error)}")
 
     def facts(self, kept: dict[str, str], remaining: dict[str, int]) -> dict[str, Any]:
         """Returns what was done, for programs."""
         stretches = []
         for stretch, frames in zip(self.stretches, self.frames, strict=True):
             values = asdict(stretch)
+            moves, ratios = values.pop("largest_moves"), values.pop("edge_ratios")
             of_frames = [
                 {"time": time, "moved": moved, "largest_move": move, "edge_ratio": ends}
-                for (time, moved), move, ends in zip(
-                    frames, values.pop("largest_moves"), values.pop("edge_ratios"), strict=True
-                )
+                for (time, moved), move, ends in zip(frames, moves, ratios, strict=True)
             ]
             stretches.append(values | {"edge_ratio": stretch.edge_ratio, "frames": of_frames})
         return {
@@ -242,7 +233,7 @@ class RepairRun:
             "output": str(self.output),
             "before": self.found,
             "remaining": remaining,
-            "initially_near": self.initially_near,
+            "initially_near": sum(finding.initially_near for finding in self.journal.findings or ()),
             "unrepaired_pairs": self.unrepaired_pairs,
             "kept": kept,
             "distorted": list(self.distorted),

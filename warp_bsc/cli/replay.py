@@ -41,12 +41,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _open_scene(arguments: argparse.Namespace, stack: contextlib.ExitStack) -> Scene:
-    """Opens the scene that the options name; meanwhile the processes that check it start, which the stack ends.
-
-    Raises:
-        FileNotFoundError: If there is no such file.
-        ValueError: If the options do not fit together, or the file is broken.
-    """
+    """Opens the scene that the options name; meanwhile the processes that check it start, which the stack ends."""
     # The file of these options is optional: without it, argparse takes the scene that follows for it.
     for option in ("json", "csv"):
         if arguments.scene is None and getattr(arguments, option) not in (None, STDOUT):

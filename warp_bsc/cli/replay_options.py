@@ -107,8 +107,8 @@ def add_scene_selection(which: argparse._ArgumentGroup) -> None:
     add_options(which, _SCENE)
 
 
-def read_selection(arguments: argparse.Namespace) -> Selection:
-    """Returns the selection that the options of :func:`add_scene_selection` make.
+def read_selection(arguments: argparse.Namespace, *, of_files: bool = False) -> Selection:
+    """Returns the selection that the options of :func:`add_scene_selection` make, of a scene or of mesh files.
 
     Raises:
         OSError: If the file of ``--triage`` cannot be read.
@@ -121,7 +121,7 @@ def read_selection(arguments: argparse.Namespace) -> Selection:
         between=tuple(arguments.between) if arguments.between else None,
         purposes=tuple(arguments.purpose or Selection.purposes),
         ignore=tuple(map(tuple, arguments.ignore)),
-        triage=read_triage(arguments.triage) if arguments.triage else (),
+        triage=read_triage(arguments.triage, of_files=of_files) if arguments.triage else (),
     )
 
 

@@ -46,15 +46,7 @@ class ReplayRun(contextlib.ExitStack):
         options: dict[str, Any],
         baseline: Baseline | None,
     ):
-        """Opens the files.
-
-        Args:
-            scene: The scene.
-            arguments: The options.
-            device: Name of the Warp device.
-            options: The options that the results depend on, except method, device and clearance.
-            baseline: The earlier replay to compare with, None without one.
-        """
+        """Opens the files; ``options`` are those that the results depend on, except method, device and clearance."""
         super().__init__()
         self._scene, self._arguments, self._baseline = scene, arguments, baseline
         self._settings = {"method": arguments.method, "device": device, "clearance": arguments.clearance}

@@ -30,12 +30,7 @@ _RANGES = 4
 
 
 def print_replay(console: Console, summary: Summary) -> None:
-    """Prints whether the scene is broken, by which pairs of meshes, the sums, and a table of the worst intervals.
-
-    Args:
-        console: The terminal or file to print to.
-        summary: The results.
-    """
+    """Prints whether the scene is broken, by which pairs of meshes, the sums, and a table of the worst intervals."""
     scene, intervals = summary.scene, summary.intervals
     say(
         console,
@@ -90,13 +85,13 @@ def print_replay(console: Console, summary: Summary) -> None:
 def print_repair(console: Console, summary: Summary, command: str) -> None:
     """Prints the command that repairs what a replay found; nothing if it found nothing that a repair can move."""
     names = {name for meshes, _ in summary.mesh_pairs for name in meshes}
-    if all(summary.scene.prim_of(name).why_not_repaired for name in names):
+    kept = kept_meshes(summary.scene).keys()
+    if names <= kept:
         return
     say(console, f"To repair: {command}")
     start = summary.intersections[0].mesh_pairs if summary.intersections else {}
     crossing = [pair for pair, (crosses, _) in start.items() if crosses and pair[0] != pair[1]]
-    kept = set(kept_meshes(summary.scene) if crossing else ())
-    if left := [pair for pair in crossing if not kept.issuperset(pair)]:
+    if left := [pair for pair in crossing if not kept >= {*pair}]:
         pairs = count(len(left), "pair")
         say(console, f"  It leaves {pairs} of meshes that cross at the first time; --include-initial repairs them too.")
         closed = closed_meshes(summary.scene)
@@ -106,13 +101,7 @@ def print_repair(console: Console, summary: Summary, command: str) -> None:
 
 
 def print_work(console: Console, works: list[Work | None], writing: float) -> None:
-    """Prints the times of the parts of the work.
-
-    Args:
-        console: The terminal or file to print to.
-        works: The work for each interval, None for those of an earlier run.
-        writing: Time to write all of them [s].
-    """
+    """Prints the times of the parts of the work, None for intervals of an earlier run, and of writing [s]."""
     done = [work for work in works if work]
     if len(done) < len(works):
         say(console, f"Taken from an earlier run: {count(len(works) - len(done), 'interval')}.")

@@ -32,11 +32,18 @@ class FileScene(Scene):
         meshes: The files of each name.
     """
 
-    def __init__(self, frames: Frames, progress: Callable[[int, int], None] | None = None):
+    def __init__(
+        self,
+        frames: Frames,
+        progress: Callable[[int, int], None] | None = None,
+        *,
+        selection: Selection = Selection(),  # noqa: B008 (frozen)
+    ):
         """Reads the files.
 
         Args:
             frames: The files.
+            selection: What is meant to meet, by the names of the files.
             progress: Called with the number of frames that have been read, and their total.
 
         Raises:
@@ -44,7 +51,7 @@ class FileScene(Scene):
             ValueError: If a file is not as its format says, or a name is there twice.
         """
         self.frames, self.stage, self.left_out = frames, None, []
-        self.path, self.selection = ", ".join(frames.names), Selection()
+        self.path, self.selection = ", ".join(frames.names), selection
         self._lock, self._unreadable = threading.RLock(), ()
         self._collecting = lambda *_: contextlib.nullcontext()
         self._record, self._jumps, self._welds = ReadingRecord(), JumpFinder(), {}
@@ -72,7 +79,7 @@ class FileScene(Scene):
             self.times.append(self.times[-1])
         inner = [index for index, time in enumerate(self.times[:-1]) if index and time in changes]
         self._spans = list(pairwise([0, *inner, len(self.times) - 1]))
-        self._warnings = [*notes, _UNKNOWN]
+        self._warnings = [*notes, _UNKNOWN, *selection.unmatched(meshes)]
         for mesh in meshes:
             if mesh.changes:
                 when = times_in_words(mesh.changes)
@@ -170,6 +177,7 @@ class FrameMesh:
 
     display_name, instanced_prim = "", ""
     is_strands = is_rigid = may_jump = has_tetrahedra = False
+    why_not_written = None
 
     def __init__(self, name: str, paths: dict[float, str], moves: bool):
         self.name = self.path = name

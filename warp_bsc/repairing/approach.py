@@ -32,18 +32,14 @@ _SOUGHT = 0.5
 
 
 def approach(surface: Surface, x: np.ndarray, springs: Springs, max_strain: float, rounds: int = _ROUNDS) -> np.ndarray:
-    """Returns positions near the input that can be reached from a start without a collision.
+    """Returns positions near the input that can be reached from a start without a collision, in units, shape [n, 3].
 
     What is free to go returns to its input. What contact keeps from it takes its neighbours along until strains are
     below the limit. Meanwhile known contacts keep their elements apart, so that a motion meets few others. Of the
     positions passed, the result has the least strain above the limit, then the least moves.
 
-    Args:
-        surface: The surface.
-        x: The start, in units of the surface, shape [n, 3]. What crosses there may cross in the end, nothing else.
-        springs: Springs of the vertices that may move.
-        max_strain: Largest strain.
-        rounds: Motions after which it ends.
+    Of the start ``x``, what crosses there may cross in the end, nothing else. The springs are those of the vertices
+    that may move. It ends after ``rounds`` motions.
     """
     best, score = x, score_of(surface, x, max_strain)
     best_score = score

@@ -33,12 +33,7 @@ def checked_mesh(mesh: Any, x: Any, device: wp.DeviceLike) -> tuple[CollisionMes
 
 
 def checked_mask(vertices: Any, name: str, count: int) -> np.ndarray:
-    """Returns which vertices are given, bool, shape [count].
-
-    Args:
-        vertices: A mask, bool, shape [count], or indices, integers, shape [n].
-        name: Name of the argument in errors.
-        count: Number of vertices.
+    """Returns which vertices are given, by a mask, bool, or indices, integers, shape [n]: a mask, bool, shape [count].
 
     Raises:
         TypeError: If they are no array of numbers.
@@ -64,10 +59,7 @@ def checked_mask(vertices: Any, name: str, count: int) -> np.ndarray:
 def checked_sets(sets: Any, name: str, count: int) -> np.ndarray:
     """Returns the set that each vertex is in, such as its sheet, -1 for none, int, shape [count].
 
-    Args:
-        sets: A number for each vertex, integers of at least -1, as an array; or a sequence of sets of vertices.
-        name: Name of the argument in errors.
-        count: Number of vertices.
+    They are given as an array of a number for each vertex, of at least -1, or as a sequence of sets of vertices.
 
     Raises:
         TypeError: If it is neither.
@@ -98,11 +90,7 @@ def checked_sets(sets: Any, name: str, count: int) -> np.ndarray:
 def checked_seams(mesh: CollisionMesh, x: np.ndarray, weld: np.ndarray, fixed: np.ndarray) -> np.ndarray:
     """Returns for each vertex the one whose position it gets where seams are closed: a fixed one if there is one.
 
-    Args:
-        mesh: The mesh.
-        x: Positions, shape [n, 3].
-        weld: The vertex that each vertex is welded to, int, shape [n].
-        fixed: Vertices that stay, bool, shape [n].
+    ``weld`` is the vertex that each one at ``x``, shape [n, 3], is welded to; ``fixed`` ones stay, bool, shape [n].
 
     Raises:
         ValueError: If two fixed vertices that are apart are welded, or two corners of a face.

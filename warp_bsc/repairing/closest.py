@@ -11,13 +11,9 @@ from .surface import Surface
 def closest_points(
     surface: Surface, x: np.ndarray, faces: np.ndarray, points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the points of some faces that are closest to given ones, and the normals there, both [n, 3].
+    """Returns the points of some faces, at least one, that are closest to given ones, and the normals there.
 
-    Args:
-        surface: The surface.
-        x: Its positions, in units, shape [m, 3].
-        faces: Numbers of the faces, at least one, int.
-        points: Points, in units, shape [n, 3].
+    Positions ``x`` of the surface and all points are in units, shapes [m, 3] and [n, 3].
     """
     target = _part(surface, x, faces)
     closest, normals = (wp.empty(len(points), dtype=wp.vec3, device=surface.device) for _ in range(2))
@@ -36,12 +32,7 @@ def exit_distances(
 ) -> np.ndarray:
     """Returns how far points are from some faces along directions, infinite where they meet none, shape [n, k].
 
-    Args:
-        surface: The surface.
-        x: Its positions, in units, shape [m, 3].
-        faces: Numbers of the faces, at least one, int.
-        points: Points, in units, shape [n, 3].
-        directions: Directions of length 1, shape [k, 3].
+    Arguments are those of :func:`closest_points`, and directions of length 1, shape [k, 3].
     """
     target = _part(surface, x, faces)
     distances = wp.empty((len(points), len(directions)), dtype=float, device=surface.device)
@@ -51,11 +42,7 @@ def exit_distances(
 
 
 def _part(surface: Surface, x: np.ndarray, faces: np.ndarray) -> wp.Mesh:
-    """Returns some faces as a mesh that Warp can search.
-
-    Raises:
-        ValueError: If there are none: a mesh of no faces corrupts the memory of a GPU in Warp 1.19.
-    """
-    if not len(faces):
+    """Returns some faces as a mesh that Warp can search."""
+    if not len(faces):  # a mesh of no faces corrupts the memory of a GPU in Warp 1.19
         raise ValueError("faces must not be empty")
     return wp.Mesh(surface.array(x, wp.vec3), surface.array(surface.mesh.faces[faces].ravel(), int))

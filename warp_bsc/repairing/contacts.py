@@ -13,8 +13,6 @@ from .kernels import Planes, find_shortfalls, move_apart
 _SWEEPS = 4
 _LEAST_MOBILITY = 0.05
 """Sum of squared weights below which a contact counts as one that hardly moves."""
-_KEY = np.array([2**31, 1])
-"""Makes one number of the numbers of two elements."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,11 +49,6 @@ class Contacts:
         _, last = np.unique(self.keys[::-1], return_index=True)
         return self.rows(len(self.keys) - 1 - last)
 
-    def mobilities(self, fixed: np.ndarray) -> np.ndarray:
-        """Returns the move of each contact by a push, as its reciprocal, where ``fixed`` vertices stay, shape [n]."""
-        movable = np.where(fixed[self.vertices], 0.0, self.weights)
-        return 1.0 / np.maximum((movable**2).sum(axis=1), _LEAST_MOBILITY)
-
     @staticmethod
     def none() -> "Contacts":
         """Returns no contacts."""
@@ -68,6 +61,12 @@ class Contacts:
         return Contacts(*(np.concatenate(values) for values in zip(*(vars(c).values() for c in contacts), strict=True)))
 
 
+def keys_of(found: Collisions) -> np.ndarray:
+    """Returns a number for each pair of elements that collide, vertex-face ones first, int64, shape [n]."""
+    vertex_face, edge_edge = (pairs.astype(np.int64) @ [2**31, 1] for pairs in (found.vertex_face, found.edge_edge))
+    return np.concatenate([vertex_face, -1 - edge_edge])
+
+
 def as_contacts(mesh: CollisionMesh, found: Collisions, gap: float = 0.0) -> Contacts:
     """Returns collisions of a mesh with faces and edges in one form; ``gap`` is the distance that they are to have."""
     beta = found.vertex_face_coordinates
@@ -75,7 +74,7 @@ def as_contacts(mesh: CollisionMesh, found: Collisions, gap: float = 0.0) -> Con
     vertex_face, edge_edge = found.vertex_face.astype(np.int64), found.edge_edge.astype(np.int64)
     toi = np.concatenate([found.vertex_face_toi, found.edge_edge_toi])
     return Contacts(
-        np.concatenate([vertex_face @ _KEY, -1 - edge_edge @ _KEY]),
+        keys_of(found),
         np.concatenate(
             [np.column_stack([vertex_face[:, 0], mesh.faces[vertex_face[:, 1]]]), mesh.edges[edge_edge].reshape(-1, 4)]
         ),
@@ -89,11 +88,8 @@ def as_contacts(mesh: CollisionMesh, found: Collisions, gap: float = 0.0) -> Con
 def as_planes(contacts: Contacts, rows: np.ndarray, fixed: np.ndarray, device: wp.DeviceLike) -> Planes:
     """Returns contacts as planes on a device.
 
-    Args:
-        contacts: The contacts.
-        rows: Row of each vertex among those that move, ascending; -1 for the others, int, shape [n].
-        fixed: Vertices that stay, bool, shape [n].
-        device: Warp device.
+    ``rows`` are those of the vertices among those that move, ascending, -1 for the others, int, and ``fixed`` ones
+    stay, bool, both of shape [n].
     """
     of_places = rows[contacts.vertices.ravel()]
     order = np.argsort(of_places, kind="stable")
@@ -105,7 +101,9 @@ def as_planes(contacts: Contacts, rows: np.ndarray, fixed: np.ndarray, device: w
     planes.weights = wp.array(contacts.weights, dtype=wp.vec4d, device=device)
     planes.normals = wp.array(contacts.normals, dtype=wp.vec3d, device=device)
     planes.gaps = wp.array(contacts.gap, dtype=wp.float64, device=device)
-    planes.mobilities = wp.array(contacts.mobilities(fixed), dtype=wp.float64, device=device)
+    movable = np.where(fixed[contacts.vertices], 0.0, contacts.weights)
+    mobilities = 1.0 / np.maximum((movable**2).sum(axis=1), _LEAST_MOBILITY)
+    planes.mobilities = wp.array(mobilities, dtype=wp.float64, device=device)
     return planes
 
 
@@ -114,12 +112,7 @@ def projected(
 ) -> np.ndarray:
     """Returns positions at which contacts have their gaps along their normals: Jacobi sweeps, averaged by vertex.
 
-    Args:
-        fixed: Vertices that stay, bool, shape [n].
-        x: Positions, float64, shape [n, 3].
-        contacts: The contacts.
-        sweeps: Number of sweeps.
-        device: Warp device.
+    Vertices that are ``fixed`` stay, bool, shape [n]; positions are float64, shape [n, 3].
     """
     count = len(contacts.toi)
     is_involved = np.zeros(len(x), dtype=bool)

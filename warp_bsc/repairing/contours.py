@@ -29,15 +29,11 @@ class Contours:
 
 
 def trace_contours(mesh: CollisionMesh, pairs: np.ndarray) -> Contours:
-    """Traces the contours through the intersections of edges with faces.
+    """Traces the contours through intersections of edges with faces: pairs (edge, face), int, shape [n, 2].
 
     Two faces cross in a segment. Each of its ends is an edge of one in the other, or a vertex of both. A contour is a
     chain of segments. At each of its points an edge of one surface passes through a face of the other, so that the
     intersections of a contour have two signs.
-
-    Args:
-        mesh: The mesh.
-        pairs: (edge, face), int, shape [n, 2].
     """
     n = len(pairs)
     rows, owners = mesh.edge_faces.find(pairs[:, 0])
@@ -52,8 +48,7 @@ def trace_contours(mesh: CollisionMesh, pairs: np.ndarray) -> Contours:
     nodes = [np.stack([2 * one + i, 2 * other + (i ^ turned)], axis=1) for i in (0, 1)]
     label = connect_cells(np.concatenate(nodes), 2 * n)
     plus, minus = label[0::2], label[1::2]
-    _, number = np.unique(np.minimum(plus, minus), return_inverse=True)
-    number = number.reshape(-1)
+    number = np.unique(np.minimum(plus, minus), return_inverse=True)[1].reshape(-1)
     count = number.max(initial=-1) + 1
     is_end_at_border = np.bincount(rows, minlength=n) < 2
     whole = np.isin(keys, keys[same])

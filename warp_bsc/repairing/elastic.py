@@ -45,12 +45,9 @@ class Springs:
     """
 
     def __init__(self, surface: Surface, movable: np.ndarray, bending: float = _BENDING):
-        """Finds the springs.
+        """Finds the springs that may move ``movable`` vertices, bool, shape [n].
 
-        Args:
-            surface: The surface.
-            movable: Vertices that they may move, bool, shape [n].
-            bending: Stiffness of the springs across edges, which keep dihedral angles, as a share of that of edges.
+        ``bending`` is the stiffness of those across edges, which keep dihedral angles, as a share of that of edges.
         """
         self._surface, self.movable = surface, movable
         vertices = self._vertices = np.flatnonzero(movable)
@@ -63,20 +60,14 @@ class Springs:
         both = np.concatenate([self._ends, self._ends[:, ::-1]])
         order = np.argsort(both[:, 0], kind="stable")
         order = self._order = order[movable[both[order, 0]]]
-        array = surface.array
-        self._springs = [
-            array(vertices, int),
-            array(np.append(np.searchsorted(both[order, 0], vertices), len(order)), int),
-            array(both[order, 1], int),
-        ]
+        starts = np.append(np.searchsorted(both[order, 0], vertices), len(order))
+        self._springs = [surface.array(values, int) for values in (vertices, starts, both[order, 1])]
         self.rest_at(surface.home, surface.edge)
 
     def rest_at(self, x: np.ndarray, edge: float) -> None:
-        """Lets the springs rest at positions, in any unit, as those of :meth:`relax` from then on.
+        """Lets the springs rest at positions, shape [n, 3], in any unit, that of :meth:`relax` from then on.
 
-        Args:
-            x: The positions, shape [n, 3].
-            edge: Median length of an edge there.
+        ``edge`` is the median length of an edge there.
         """
         lengths = np.linalg.norm(x[self._ends[:, 1]] - x[self._ends[:, 0]], axis=1)
         shortness = np.clip(edge / np.maximum(lengths, 1e-30), 0.1, _SHORTEST)
@@ -121,27 +112,17 @@ class Springs:
             contacts: Contacts that are kept apart meanwhile, nearly; default: none.
             around: The movable vertices that move, bool, shape [n]; default: all.
         """
-        planes = Planes() if contacts is None or not len(contacts.toi) else self._planes(contacts)
-        rows, count = None, len(self._vertices)
+        planes, rows, count = Planes(), None, len(self._vertices)
+        if contacts is not None and len(contacts.toi):
+            row = np.where(self.movable, np.cumsum(self.movable) - 1, -1)
+            planes = as_planes(contacts, row, self._surface.fixed, self._surface.device)
         if around is not None:
             (moving,) = np.nonzero(around[self._vertices])
             rows, count = self._surface.array(moving, int), len(moving)
-        inputs = [
-            rows,
-            *self._springs,
-            self._lengths,
-            self._by_strain if momentum else self._even,
-            planes,
-            wp.float64(slack),
-            wp.float64(momentum),
-        ]
+        stiffness = self._by_strain if momentum else self._even
+        numbers = wp.float64(slack), wp.float64(momentum)
+        inputs = [rows, *self._springs, self._lengths, stiffness, planes, *numbers]
         return self._sweep(relax_springs, count, inputs, x, sweeps)
-
-    def _planes(self, contacts: Contacts) -> Planes:
-        """Returns contacts as planes, by the rows of the vertices."""
-        row = np.full(len(self.movable), -1)
-        row[self._vertices] = np.arange(len(self._vertices))
-        return as_planes(contacts, row, self._surface.fixed, self._surface.device)
 
     def _sweep(self, kernel: wp.Kernel, dim: int, inputs: list, values: np.ndarray, sweeps: int) -> np.ndarray:
         """Returns values after some launches of a kernel that writes those of movable vertices."""

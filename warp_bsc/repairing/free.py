@@ -37,7 +37,7 @@ def search(
 
     Args:
         surface: The surface.
-        max_strain: Largest strain that is sought.
+        max_strain: Largest strain that is sought, of all functions here.
         history: Positions at which nothing crosses, in units, shape [n, 3]; default: none.
         sheet: Sheet of each vertex from inside to outside, -1 for none, int, shape [n]; default: not known.
 
@@ -57,14 +57,7 @@ def search(
     return before, before, np.full_like(chosen, -1)
 
 
-def _found(
-    surface: Surface,
-    before: Faults,
-    max_strain: float,
-    history: np.ndarray | None,
-    sheet: np.ndarray | None,
-    chosen: np.ndarray,
-) -> np.ndarray:
+def _found(surface: Surface, before: Faults, max_strain: float, history, sheet, chosen: np.ndarray) -> np.ndarray:
     """Returns the best positions that :func:`search` finds, in units; they may be worse than the input."""
     if history is not None:
         reached = approach(surface, history, Springs(surface, ~surface.fixed), max_strain)
@@ -109,12 +102,8 @@ def free(
 ) -> np.ndarray:
     """Returns positions near the input at which less crosses, or is near, in units of the surface; or worse ones.
 
-    Args:
-        surface: The surface.
-        start: Where the search begins, in units, shape [n, 3].
-        crossings: What crosses there, (edge, face), shape [m, 2].
-        max_strain: Largest strain that is sought.
-        movable: Vertices that may move, bool, shape [n], beside those near contours and near pairs.
+    At the start, where the search begins, are the ``crossings``, (edge, face), shape [m, 2]. Beside vertices near
+    contours and near pairs, ``movable`` ones may move, bool, shape [n].
     """
     x, springs = _opened(surface, start, crossings, movable)
     left = _pieces_that_cross(surface, x)
@@ -149,14 +138,10 @@ def _returned(surface: Surface, x: np.ndarray, springs: Springs, max_strain: flo
 
 
 def offset(surface: Surface, crossings: np.ndarray) -> np.ndarray:
-    """Returns the input with what crosses moved along its normals, if nothing crosses then; else the input.
+    """Returns the input with its crossings, (edge, face), moved along normals, if nothing crosses then; else the input.
 
     Layers that lie on each other have no contours that tell a side. Those of one sheet that is folded have opposite
     normals, and pieces move by different distances.
-
-    Args:
-        surface: The surface.
-        crossings: What crosses in the input, (edge, face), shape [m, 2].
     """
     faces, x = surface.mesh.faces, surface.home
     a, b, c = (x[faces[:, k]] for k in range(3))
@@ -182,11 +167,6 @@ def free_by_smoothing(surface: Surface, start: np.ndarray, max_strain: float) ->
 
     Smoothing opens what a piece has folded through itself from a border, whose contours have nowhere else to go. A
     piece keeps its place and the lengths of its edges, in the mean.
-
-    Args:
-        surface: The surface.
-        start: Where the search begins, in units, shape [n, 3].
-        max_strain: Largest strain that is sought.
     """
     edges, piece = surface.edges, surface.piece
     first, second = _pieces_that_cross(surface, start).T
@@ -220,14 +200,9 @@ def free_by_order(
 ) -> np.ndarray:
     """Returns positions in which pieces that cross each other have left each other, to the side where they move less.
 
-    Args:
-        surface: The surface.
-        x: Where the search begins, in units, shape [n, 3].
-        max_strain: Largest strain that is sought.
-        rank: Tells whether positions are wrecked, how much crosses, how much is near, the strain above the limit, and
-            the squared moves.
-        chosen: Sheet of each vertex from inside to outside, -1 for none, int, shape [n]; those that are chosen are
-            written.
+    The search begins at ``x``, in units, shape [n, 3]. ``rank`` tells of positions whether they are wrecked, how much
+    crosses, how much is near, the strain above the limit, and the squared moves. The sheets that are chosen are written
+    to those of the vertices, from inside to outside, -1 for none, int, shape [n].
     """
     piece, tried = surface.piece, set()
     while True:
@@ -258,11 +233,6 @@ def _restored(surface: Surface, before: Faults, after: Faults) -> np.ndarray:
     """Returns positions in which parts that still have most of their faults are as in the input.
 
     A part is connected by vertices that have moved and by crossings. What is fixed on both sides is no fault of a part.
-
-    Args:
-        surface: The surface.
-        before: What is wrong with the input.
-        after: What is wrong with the positions.
     """
     mesh = surface.mesh
     moved = surface.moved(after.x)

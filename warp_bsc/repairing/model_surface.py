@@ -14,7 +14,7 @@ from ..response.report.inside import Inside, InsideFinder
 from ..response.state.mesh import ModelMesh, Placement, elements_of
 from ..response.state.motion import plane_in
 from .solids import leave_solid, leave_solid_whole, spread_exits
-from .surface import Surface, differ, weld_borders
+from .surface import Surface, weld_borders
 
 _ESCAPES = 4
 """Times that particles are put outside: the way out of a solid may lead into another one."""
@@ -29,12 +29,7 @@ class ModelSurface(Surface):
     """
 
     def __init__(self, model: newton.Model, state: newton.State, min_distance: float):
-        """Places the mesh of a model.
-
-        Args:
-            model: The model.
-            state: The state.
-            min_distance: Distance that pairs keep [m].
+        """Places the mesh of a model, of which pairs keep a minimum distance [m].
 
         Raises:
             ValueError: If a position is not finite.
@@ -84,15 +79,9 @@ class ModelSurface(Surface):
             yield outside, moved if movable is None else movable
 
     def _leave_solids(self, x: np.ndarray, *, whole: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Puts particles that are inside solids outside.
+        """Returns positions in units with particles outside that are inside solids, and which vertices may have moved.
 
-        Args:
-            x: Positions, in units, shape [n, 3].
-            whole: Whether what is connected moves as a whole, if it is free to; otherwise those around the particles
-                follow.
-
-        Returns:
-            Positions in units, and which vertices may have moved, bool, shape [n].
+        What is connected moves as a whole, if ``whole`` and it is free to; otherwise those around the particles follow.
         """
         movable, corners = np.zeros(len(x), dtype=bool), self.given.faces[:, 0]
         body = connect_cells(self.edges, len(x))
@@ -110,13 +99,12 @@ class ModelSurface(Surface):
                 is_face = (self._shape[corners] == shape) & (self._world[corners] == world)
                 (faces,) = np.nonzero(is_face & (self._soft_body[corners] == soft_body))
                 if whole:
-                    of_bodies = leave_solid_whole(self, x, faces, of_solid, body)
-                    moves = np.where(differ(of_bodies, np.zeros_like(x))[:, None], of_bodies, moves)
+                    leave_solid_whole(self, x, faces, of_solid, body, moves)
                 else:
                     moves[of_solid] = leave_solid(self, x, faces, of_solid)
                     moved[of_solid] = True
             if whole:
-                movable |= differ(moves, np.zeros_like(x))
+                movable |= moves.any(axis=1)
                 x = self.rounded(x + moves)
             else:
                 x, reach = spread_exits(self, x, moves, moved)
@@ -143,8 +131,7 @@ def _with_planes(
 ) -> tuple[CollisionMesh, np.ndarray, np.ndarray, np.ndarray]:
     """Returns a mesh with a large square in place of each infinite plane, in each of its worlds.
 
-    Returns:
-        The mesh, its positions [m], float32, and the shape, -1 for particles, and the world of each vertex, int.
+    Also returns its positions [m], float32, and the shape, -1 for particles, and the world of each vertex, int.
     """
     world = mesh.device_world.numpy()
     shape = np.append(np.full(mesh.model.particle_count, -1), mesh.shape_vertices.shape)

@@ -157,11 +157,7 @@ def contacts_at(surface: Surface, x: np.ndarray, held: np.ndarray) -> Contacts:
 def _contacts(surface: Surface, start: np.ndarray, goal: np.ndarray, near: np.ndarray) -> Contacts:
     """Returns the contacts of a motion between positions in units; pairs at rest stay as they are.
 
-    Args:
-        surface: The surface.
-        start: Positions at the start.
-        goal: Positions at the end.
-        near: Keys of the pairs that do not keep the minimum distance at the start: they must only not touch.
+    ``near`` are the keys of the pairs that do not keep the minimum distance at the start: they must only not touch.
     """
     x0, x1 = surface.detected(start), surface.detected(goal)
     contacts = as_contacts(surface.mesh, surface.detector.detect(x0, x1))

@@ -98,7 +98,13 @@ def repair(
     is_fixed = checked_mask(() if fixed is None else fixed, "fixed", len(given))
     sheet = None if order is None else checked_sets(order, "order", len(given))
     groups = None if rigid is None else checked_sets(rigid, "rigid", len(given))
-    previous = given if x_previous is None else _checked_previous(x_previous, given, mesh)
+    previous = given
+    if x_previous is not None:
+        previous = checked_shape(x_previous, (3,), "x_previous")
+        if previous.dtype != given.dtype or len(previous) != len(given):
+            ours, theirs = (f"{at.dtype} {at.shape}" for at in (given, previous))
+            raise ValueError(f"x_previous must have the type and the rows of x, {ours}, not {theirs}")
+        check_finite(previous, "x_previous", mesh.vertices)
     distance = checked_distance(min_distance, "min_distance")
     tolerance = checked_distance(seam_tolerance, "seam_tolerance")
     strain = checked_number(max_strain, "max_strain", 0.0, above=True)
@@ -118,21 +124,6 @@ def repair(
     positions = surface.positions(after.x)
     found = describe(surface, before, after, chosen, len(given))
     found["moved"][opened] = np.linalg.norm(positions[opened].astype(float) - given[opened], axis=1)
-    return RepairResult(**found, x=_as_given(positions, x))
-
-
-def _checked_previous(x_previous: np.ndarray | wp.array, x: np.ndarray, mesh: CollisionMesh) -> np.ndarray:
-    """Returns the configuration before as NumPy."""
-    previous = checked_shape(x_previous, (3,), "x_previous")
-    if previous.dtype != x.dtype or len(previous) != len(x):
-        raise ValueError(
-            f"x_previous must have the type and the rows of x, {x.dtype} {x.shape}, not {previous.dtype} "
-            f"{previous.shape}"
-        )
-    check_finite(previous, "x_previous", mesh.vertices)
-    return previous
-
-
-def _as_given(result: np.ndarray, x: np.ndarray | wp.array | None) -> np.ndarray | wp.array:
-    """Returns positions as a Warp array where the input was one, of its type and on its device."""
-    return wp.array(result, dtype=x.dtype, device=x.device) if isinstance(x, wp.array) else result
+    if isinstance(x, wp.array):
+        positions = wp.array(positions, dtype=x.dtype, device=x.device)
+    return RepairResult(**found, x=positions)

@@ -107,21 +107,14 @@ def describe(surface: Surface, before: Faults, after: Faults, chosen: np.ndarray
 
 
 def _unresolved_contours(surface: Surface, crossings: np.ndarray) -> tuple[UnresolvedContour, ...]:
-    """Returns the contours of crossings, with the edges of the mesh as it was given.
-
-    Args:
-        surface: The surface.
-        crossings: What crosses, (edge, face) of the surface, shape [m, 2].
-    """
-    mesh, weld = surface.given, surface.weld
+    """Returns the contours of crossings, (edge, face) of the surface, with the edges of the mesh as it was given."""
     if not len(crossings):
         return ()
     contours, late = trace_contours(surface.mesh, crossings), surface.is_late
-    fixed = surface.are_fixed(crossings)
-    n = len(weld)
-    keys = np.sort(weld[mesh.edges], axis=1).astype(np.int64) @ np.array([n, 1])
+    fixed, key = surface.are_fixed(crossings), np.array([len(surface.weld), 1])
+    keys = np.sort(surface.weld[surface.given.edges], axis=1).astype(np.int64) @ key
     unique, first = np.unique(keys, return_index=True)  # an edge of the given mesh for each one of the welded mesh
-    welded_keys = surface.mesh.edges[crossings[:, 0]].astype(np.int64) @ np.array([n, 1])
+    welded_keys = surface.mesh.edges[crossings[:, 0]].astype(np.int64) @ key
     elements = np.column_stack([first[np.searchsorted(unique, welded_keys)], crossings[:, 1]]).astype(np.int32)
     found = []
     for number, kind in enumerate(contours.kinds):

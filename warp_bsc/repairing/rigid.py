@@ -26,31 +26,23 @@ class RigidGroups:
         self.links = links[links[:, 0] != links[:, 1]]
 
     def placed(self, x: np.ndarray, home: np.ndarray, rounding: np.ndarray) -> np.ndarray:
-        """Returns positions at which each group is rotated and moved as a whole, nearest to given ones.
+        """Returns positions at which each group is rotated and moved as a whole from the input, nearest to given ones.
 
-        Args:
-            x: Positions, shape [n, 3]. Those of groups that are rigid up to rounding stay.
-            home: The input, shape [n, 3].
-            rounding: Rounding error of each coordinate of vertices of groups, shape [m, 3].
+        Those of groups that are rigid up to rounding stay; ``rounding`` is the error of each coordinate of vertices of
+        groups, shape [m, 3].
         """
-        fitted = self._fitted(x, home, np.ones(len(self.vertices)))
+        fitted = self.fitted(x, home, np.ones(len(self.vertices)))
         off, allowed = np.zeros(self._count), np.zeros(self._count)
         np.maximum.at(off, self._group, np.abs(fitted - x[self.vertices]).max(axis=1))
         np.maximum.at(allowed, self._group, _ROUNDINGS * rounding.max(axis=1))
         return self._with(x, fitted, off > allowed)
 
     def carried(self, x: np.ndarray, home: np.ndarray, pushed: np.ndarray) -> np.ndarray:
-        """Returns positions at which groups follow those of their vertices that are pushed, and else move least.
-
-        Args:
-            x: Positions, shape [n, 3].
-            home: The input, shape [n, 3].
-            pushed: Vertices that are pushed, bool, shape [n].
-        """
+        """Returns positions at which groups follow those of their vertices that are pushed, and else move least."""
         leads = pushed[self.vertices]
         share = np.bincount(self._group, leads, self._count) / np.bincount(self._group)
         weights = np.where(leads, 1.0, _SLIGHT * share[self._group])
-        return self._with(x, self._fitted(x, home, weights), share > 0.0)
+        return self._with(x, self.fitted(x, home, weights), share > 0.0)
 
     def least(self, values: np.ndarray) -> np.ndarray:
         """Returns values of vertices, shape [n], with the least one of each group for all of its vertices."""
@@ -66,7 +58,7 @@ class RigidGroups:
         result[self.vertices[rows]] = fitted[rows]
         return result
 
-    def _fitted(self, x: np.ndarray, home: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    def fitted(self, x: np.ndarray, home: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Returns the positions of groups after the rotation and move that weighted squares are least with (Kabsch)."""
         group, count = self._group, self._count
         total = np.maximum(np.bincount(group, weights, count), 1e-300)

@@ -11,16 +11,13 @@ _GAP = 0.5
 """Distance from the sheets inside at which a vertex is put, in edges."""
 _ALONG_NORMAL = 0.5
 """Least cosine between the way to the closest point of a sheet and its normal; less is beyond the border."""
-_RINGS = 12
-_SWEEPS = 12
+_RINGS = _SWEEPS = 12
 
 
 def joined_sheets(sheet: np.ndarray, weld: np.ndarray) -> np.ndarray:
-    """Returns the sheet of each vertex, -1 for those that join two sheets: a seam between them stays closed.
+    """Returns the sheet of each vertex, int, shape [n], -1 for those that join two sheets: a seam between them stays.
 
-    Args:
-        sheet: Sheet of each vertex from inside to outside, -1 for none, int, shape [n].
-        weld: The vertex that each vertex is welded to, int, shape [n].
+    ``sheet`` is that of each vertex from inside to outside, -1 for none; ``weld`` is the vertex that it is welded to.
     """
     differs = np.bincount(weld, sheet != sheet[weld], len(sheet)) > 0
     return np.where(differs[weld], -1, sheet)
@@ -32,10 +29,8 @@ def separate_sheets(surface: Surface, sheet: np.ndarray, x: np.ndarray) -> np.nd
     Parts of a sheet that are behind the sheets inside, bounded by contours, move in front of these: to the side to
     which their faces point. Where the sheet is fixed, the sheets inside move back instead.
 
-    Args:
-        surface: The surface.
-        sheet: Sheet of each vertex from inside to outside, -1 for none, int, shape [n].
-        x: Positions from which they move, in units, shape [n, 3].
+    ``sheet`` is that of each vertex from inside to outside, -1 for none, int, shape [n]; they move from positions ``x``
+    in units, shape [n, 3].
     """
     for outer in np.unique(sheet[sheet > sheet[sheet >= 0].min(initial=0)]):
         inside, outside = (sheet >= 0) & (sheet < outer), sheet == outer
@@ -49,12 +44,7 @@ def separate_sheets(surface: Surface, sheet: np.ndarray, x: np.ndarray) -> np.nd
 def _put_on_side(surface: Surface, x: np.ndarray, moving: np.ndarray, obstacle: np.ndarray, side: float) -> np.ndarray:
     """Returns positions in which moving vertices are on one side of the faces of an obstacle.
 
-    Args:
-        surface: The surface.
-        x: Positions, in units, shape [n, 3].
-        moving: Vertices of the sheet that moves, bool, shape [n].
-        obstacle: Vertices of the sheets that it leaves, bool, shape [n].
-        side: 1 for the side to which the faces point, -1 for the other.
+    ``moving`` and ``obstacle`` are masks of the vertices; ``side`` is 1 for that to which the faces point, else -1.
     """
     mesh = surface.mesh
     crossings = surface.crossings(surface.rounded(x))

@@ -21,11 +21,8 @@ _RINGS = _SWEEPS = 12
 def leave_solid(surface: Surface, x: np.ndarray, faces: np.ndarray, vertices: np.ndarray) -> np.ndarray:
     """Returns the moves of vertices inside a solid that put them outside, in units, shape [m, 3].
 
-    Args:
-        surface: The surface.
-        x: Its positions, in units, shape [n, 3].
-        faces: Numbers of the faces of the solid, int.
-        vertices: Vertices that are inside, sorted, int, shape [m].
+    Positions ``x`` of the surface are in units, shape [n, 3]; ``faces`` are those of the solid, and the vertices, shape
+    [m], are sorted.
     """
     closest, normals = closest_points(surface, x, faces, x[vertices])
     ways = closest - x[vertices]
@@ -43,25 +40,19 @@ def leave_solid(surface: Surface, x: np.ndarray, faces: np.ndarray, vertices: np
 
 
 def leave_solid_whole(
-    surface: Surface, x: np.ndarray, faces: np.ndarray, vertices: np.ndarray, body: np.ndarray
-) -> np.ndarray:
-    """Returns the moves of all vertices, in units, that put the bodies of vertices inside a solid outside of it.
+    surface: Surface, x: np.ndarray, faces: np.ndarray, vertices: np.ndarray, body: np.ndarray, moves: np.ndarray
+) -> None:
+    """Writes the moves of all vertices that put the bodies of vertices inside a solid outside of it.
 
-    Args:
-        surface: The surface.
-        x: Its positions, in units, shape [n, 3].
-        faces: Numbers of the faces of the solid, int.
-        vertices: Vertices that are inside, sorted, int.
-        body: Body of each vertex, which moves as a whole, int, shape [n].
+    Arguments are those of :func:`leave_solid`, the body of each vertex, which moves as a whole, int, shape [n], and the
+    moves, in units, shape [n, 3].
     """
     closest, _ = closest_points(surface, x, faces, x[vertices])
-    moves = np.zeros_like(x)
     for number in np.unique(body[vertices]):
         (rows,) = np.nonzero(body[vertices] == number)
         direction, exits = _common_way(surface, x, faces, vertices[rows], (closest - x[vertices])[rows])
         if np.isfinite(exits).all():
             moves[body == number] = (exits.max() + _GAP * surface.edge) * direction
-    return moves
 
 
 def _common_way(
@@ -69,12 +60,7 @@ def _common_way(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns the direction in which vertices leave a solid soonest, all of them, and how far each one is from outside.
 
-    Args:
-        surface: The surface.
-        x: Its positions, in units, shape [n, 3].
-        faces: Numbers of the faces of the solid, int.
-        vertices: Vertices that are inside, int, shape [m].
-        ways: Their ways to the closest points of the solid, in units, shape [m, 3].
+    ``ways`` are theirs to the closest points of the solid, in units, shape [m, 3].
     """
     deepest = np.argsort(-np.linalg.norm(ways, axis=1), kind="stable")
     chosen = deepest[np.linspace(0, len(ways) - 1, _SAMPLES).astype(int)]
@@ -93,11 +79,8 @@ def spread_exits(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns positions after moves of some vertices that others join, and which vertices may have moved.
 
-    Args:
-        surface: The surface.
-        x: Positions, in units, shape [n, 3].
-        moves: Moves, 0 where there are none, in units, shape [n, 3].
-        moved: Vertices that they are for, bool, shape [n].
+    Positions, and moves, 0 where there are none, are in units, shape [n, 3]; ``moved`` are the vertices that they are
+    for, bool, shape [n].
     """
     reach = near(surface, np.flatnonzero(moved), _RINGS)
     return surface.rounded(x + Springs(surface, reach).spread(moves, moved, _SWEEPS)), reach

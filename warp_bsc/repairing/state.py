@@ -15,7 +15,7 @@ from .free import search
 from .model_surface import ModelSurface
 from .results import RepairResult, describe
 from .sheets import joined_sheets
-from .tetrahedra import are_inverted
+from .tetrahedra import find_inverted
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,14 +92,12 @@ def repair_state(
     if after is not before:
         assert state.particle_q is not None
         state.particle_q.assign(x[:count])
-    found = describe(surface, before, after, chosen, count)
-    tetrahedra = surface.tetrahedra
     return StateRepairResult(
-        **found,
+        **describe(surface, before, after, chosen, count),
         x=x[:count],
         inside_before=len(before.inside),
         inside=surface.particles_inside(after.x),
-        inverted_before=int(are_inverted(surface.detected(before.x), tetrahedra).sum()),
-        inverted=int(are_inverted(surface.detected(after.x), tetrahedra).sum()),
+        inverted_before=len(find_inverted(surface, before.x)),
+        inverted=len(find_inverted(surface, after.x)),
         mesh=surface.given,
     )

@@ -67,10 +67,7 @@ def _pairs_within(places: np.ndarray, labels: list[np.ndarray], tolerance: float
 def welded(mesh: CollisionMesh, weld: np.ndarray, radius: np.ndarray | None = None) -> CollisionMesh:
     """Returns the mesh whose faces and edges use no vertex that is welded to another one, with the same numbers.
 
-    Args:
-        mesh: The mesh.
-        weld: The vertex that each vertex is welded to, int, shape [n].
-        radius: Radius of each vertex in place of those of the mesh; default: none.
+    ``weld`` is the vertex that each one is welded to, int, shape [n]; ``radius`` replaces the radii of the mesh.
     """
     if mesh.radius is radius and not mesh.only_free and (weld == np.arange(len(weld))).all():
         return mesh
@@ -82,7 +79,7 @@ def welded(mesh: CollisionMesh, weld: np.ndarray, radius: np.ndarray | None = No
 
 def sums(rows: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
     """Returns the sums of the values, shape [n, k], of each row, in their order, shape [count, k]."""
-    return np.stack([np.bincount(rows, column, count) for column in values.T], axis=1)
+    return np.stack([np.bincount(rows, column, count) for column in values.T], axis=1, dtype=float)  # also of no rows
 
 
 def differ(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -309,11 +306,7 @@ class Surface:
 
 
 def _frame_of(x: np.ndarray) -> tuple[np.ndarray, float]:
-    """Returns an offset, shape [3], and a unit, a power of 2, that positions lose no bit by: else 0 and 1.
-
-    Args:
-        x: Positions, float32 or float64, shape [n, 3].
-    """
+    """Returns an offset, shape [3], and a unit, a power of 2, that positions lose no bit by: else 0 and 1."""
     unchanged = np.zeros(3), 1.0
     if not len(x):
         return unchanged

@@ -39,10 +39,7 @@ def untangle(surface: Surface, x: np.ndarray, crossings: np.ndarray) -> tuple[np
     their mean. The moves spread over the surface, and springs restore its lengths and angles. What remains are mostly
     folds that are smaller than a few elements, whose contours have no side to go to: these are smoothed away.
 
-    Args:
-        surface: The surface.
-        x: The start, in units of the surface, shape [n, 3].
-        crossings: What crosses there, (edge, face), shape [m, 2].
+    The start ``x`` is in units of the surface, shape [n, 3]; ``crossings`` are those there, (edge, face), shape [m, 2].
     """
     inner = np.zeros(len(x), dtype=bool)
     springs = Springs(surface, inner)
@@ -68,13 +65,9 @@ def untangle(surface: Surface, x: np.ndarray, crossings: np.ndarray) -> tuple[np
 def _contour_moves(
     surface: Surface, x: np.ndarray, crossings: np.ndarray, *, whole: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the moves of vertices that shorten contours, and which vertices they are for.
+    """Returns the moves of vertices that shorten contours, in units, and which vertices they are for.
 
-    Args:
-        surface: The surface.
-        x: Positions, in units, shape [n, 3].
-        crossings: (edge, face), shape [m, 2].
-        whole: Whether all edges of a contour move alike.
+    All edges of a contour move alike if ``whole``.
     """
     mesh = surface.mesh
     ends, corners = mesh.edges[crossings[:, 0]], mesh.faces[crossings[:, 1]]
@@ -107,10 +100,7 @@ def _contour_moves(
 
 
 def _ways_to_ends(surface: Surface, x: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """Returns the directions in which edges without faces leave a face: away from the end of their strand.
-
-    A direction is 0 if no end is near. Shape [m, 3].
-    """
+    """Returns the directions in which edges without faces leave a face: away from the end of their strand, or 0."""
     mesh = surface.mesh
     strands = mesh.edges[mesh.free_edges]
     rings = np.where(np.bincount(strands.ravel(), minlength=len(x)) == 1, 0, _LONGEST_END)

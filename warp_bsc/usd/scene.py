@@ -427,13 +427,7 @@ class Scene:
 
 
 def _open_again(path, options, revealed, versions, contents) -> Scene:
-    """Opens a scene that another process has opened.
-
-    Raises:
-        ImportError: If OpenUSD is missing or too old here.
-        OSError: If the file does not exist here.
-        ValueError: If the file or the scene differs here.
-    """
+    """Opens a scene that another process has opened; a ValueError if the file or the scene differs here."""
     check_openusd()
     scene = Scene.__new__(Scene)
     scene._open(path, options, revealed)

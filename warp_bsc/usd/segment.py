@@ -373,11 +373,9 @@ class Segment:
         return ends
 
     def _measure_curves(self) -> tuple[np.ndarray, np.ndarray]:
-        """Measures curves at the segment's first time, in the scene's unit of length.
+        """Returns the distance of each vertex from the start along its curve at the first time, and the curve's length.
 
-        Returns:
-            The distance of each vertex from the start along its curve, NaN without a curve, and the length of its curve
-            if that is closed, else infinity; each of shape [vertex_count].
+        The distance is NaN without a curve; the length is infinity if it is not closed. Both are in the scene's unit.
         """
         ends, x = self._unwelded_edges, self.start_positions.astype(np.float64)
         lengths = np.linalg.norm(x[self.free_edges[:, 1]] - x[self.free_edges[:, 0]], axis=1)

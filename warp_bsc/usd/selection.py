@@ -125,15 +125,15 @@ class Selection:
         """Whether some pairs of meshes may not be checked, or may be ignored."""
         return bool(self.between or self.ignore or self.triage or self.ignored_names or not self.self_collisions)
 
-    def unmatched(self, meshes: Sequence[NamedMesh]) -> dict[str, list[tuple[str, ...]]]:
-        """Returns what is to be ignored and has a pattern that matches no mesh, by the attribute, given all meshes."""
-        named = {"ignore": self.ignore, "triage": [entry.meshes for entry in self.triage]}
-        return {
-            name: [
+    def unmatched(self, meshes: Sequence[NamedMesh]) -> list[str]:
+        """Returns what is to be ignored and has a pattern that matches no mesh, in words, given all meshes."""
+        texts = []
+        for name, entries in {"ignore": self.ignore, "triage": [entry.meshes for entry in self.triage]}.items():
+            if bad := [
                 entry for entry in entries if not all(any(_matches(m, pattern) for m in meshes) for pattern in entry)
-            ]
-            for name, entries in named.items()
-        }
+            ]:
+                texts.append(f"{name}: entries that match no meshes: {len(bad)}, the first is {' '.join(bad[0])}")
+        return texts
 
     def meant(self, first: NamedMesh, second: NamedMesh) -> Meant | None:
         """Returns the first entry of the triage by which two meshes are meant to meet, None without one."""
@@ -195,13 +195,8 @@ def _checked_pairs(values, name) -> tuple[tuple[str, str], ...]:
 def _are_of(patterns: tuple[str, ...], meshes: Sequence[NamedMesh], a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Returns which pairs are of a mesh of the first pattern and one of the second, bool, shape [n].
 
-    With a single pattern they are of two meshes, at least one of which matches it.
-
-    Args:
-        patterns: The patterns, one or two.
-        meshes: The meshes.
-        a: Index of one mesh of each pair, shape [n].
-        b: Index of the other, shape [n].
+    With a single pattern they are of two meshes, at least one of which matches it. ``a`` and ``b`` are the indices of
+    the meshes of the pairs, shape [n].
     """
     first, last = (np.array([_matches(mesh, pattern) for mesh in meshes]) for pattern in (patterns[0], patterns[-1]))
     if len(patterns) == 1:

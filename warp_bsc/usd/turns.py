@@ -93,9 +93,8 @@ def _are_straight(start: np.ndarray, end: np.ndarray, between: np.ndarray) -> np
 def _fit_turns(shares: np.ndarray, matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns the turns of meshes: centres and vectors, each of shape [n, 3], and whether they fit, bool, shape [n].
 
-    Args:
-        shares: The times, those of :data:`_COUNTED` among them; the first two are 0 and 1; shape [k].
-        matrices: Transforms of the meshes at these times, shape [n, k, 4, 4].
+    ``matrices`` are their transforms, shape [n, k, 4, 4], at ``shares``, those of :data:`_COUNTED` among them, shape
+    [k]; the first two are 0 and 1.
     """
     finite = np.asarray(np.isfinite(matrices).all(axis=(1, 2, 3)))
     matrices = np.where(finite[:, None, None, None], matrices, np.eye(4))
@@ -119,12 +118,7 @@ def _fit_turns(shares: np.ndarray, matrices: np.ndarray) -> tuple[np.ndarray, np
 
 
 def _rotation_vectors(shares: np.ndarray, rotations: np.ndarray) -> np.ndarray:
-    """Returns the axis times the angle of whole rotations, from rotations after shares of them; 0 without an axis.
-
-    Args:
-        shares: The shares, shape [k].
-        rotations: The rotations, shape [n, k, 3, 3].
-    """
+    """Returns the axis times the angle of whole rotations, 0 without an axis, from rotations after shares of them."""
     r = rotations
     skews = [r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]]
     skews = 0.5 * np.stack(skews, axis=-1)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pxr import Sdf, Usd, UsdGeom
+from pxr import Sdf, UsdGeom
 from replay_files import Page
 from usd_stages import CORNERS, add_instancer, add_mesh, add_tets, falling, find, hits, new_stage, save
 
@@ -176,20 +176,3 @@ def test_instances_are_named(stage):
     add_tets(stage, {0: CORNERS, 1: [*CORNERS[:3], (0, 0, -1)]}, path="/World/Many/Soft")
     spans = find(stage, "--no-self")["inversion_spans"]
     assert [span["meshes"] for span in spans] == [["/World/Many[0]/Soft"], ["/World/Many[1]/Soft"]]
-
-
-def test_a_repair_moves_none(stage, tmp_path, capsys):
-    """It moves what they collide with, and says so, with a status; not of an obstacle that the options name."""
-    mesh = add_tets(stage, {0: CORNERS, 1: CORNERS}, surface=SURFACE)
-    add_mesh(
-        stage, "/World/Falling", {at: [(0.1, 0.1, z), (0.2, 0.1, z), (0.1, 0.2, z)] for at, z in ((0, 2), (1, 0.2))}
-    )
-    out = tmp_path / "fixed.usda"
-    assert main(["repair", save(stage), "--device", "cpu", "--output", str(out)]) == 4
-    assert "note: /World/Soft is not moved: its tetrahedra could invert" in capsys.readouterr().out
-    fixed = Usd.Stage.Open(str(out))
-    assert np.array_equal(
-        UsdGeom.TetMesh(fixed.GetPrimAtPath("/World/Soft")).GetPointsAttr().Get(1), mesh.GetPointsAttr().Get(1)
-    )
-    assert find(str(out))["hits"] == 0
-    assert main(["repair", save(stage), "--device", "cpu", "--output", str(out), "--keep", "/World/Soft"]) == 0

@@ -11,16 +11,12 @@ MARGIN = BLEND + _SMOOTHINGS
 
 
 def blend(displacements: np.ndarray) -> np.ndarray:
-    """Returns displacements that grow before those given and fade after them, and are not much smaller anywhere.
+    """Returns displacements, shape [frames, n, 3], that grow before those given, and fade after them.
 
     The one of a vertex at a frame is the largest of those at the frames around it, each weighted by a smooth step that
     falls to 0 over :data:`BLEND` frames, then averaged over neighbouring frames. The first frame keeps its own.
-
-    Args:
-        displacements: Shape [frames, n, 3].
     """
-    given = displacements.astype(np.float32)
-    count = len(given)
+    given, count = displacements.astype(np.float32), len(displacements)
     size = np.linalg.norm(given, axis=2)
     blended, largest = np.zeros_like(given), np.zeros_like(size)
     for shift in range(-BLEND, BLEND + 1):

@@ -15,12 +15,13 @@ from ...usd.interval import Interval
 from ...usd.scene import Scene
 from ...usd.segment import Segment
 from ...usd.selection import Selection
+from ..contacts import keys_of
 
 MeshPair = tuple[str, str]
 """Names of two meshes."""
 
-_KEY = np.array([2**31, 1])
-"""Makes one number of the numbers of two elements."""
+INVERTED = "inverted tetrahedra"
+"""The name of their number, see :func:`count_found`."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,7 @@ class Finding:
         unrepaired_hits: Number of pairs that collide of meshes that stay as they are.
         kept_hits: Number of those of meshes that are kept.
         ignored_pairs: Pairs of meshes that collide and are ignored.
+        inverted: Number of tetrahedra that invert or are inverted; None if no mesh has any.
     """
 
     hits: int
@@ -55,6 +57,7 @@ class Finding:
     unrepaired_hits: int = 0
     kept_hits: int = 0
     ignored_pairs: tuple[MeshPair, ...] = ()
+    inverted: int | None = None
 
     @property
     def is_free(self) -> bool:
@@ -69,9 +72,10 @@ def count_found(findings: list[Finding], min_distance: float) -> dict[str, int]:
     if min_distance:
         counts[f"pairs nearer than {min_distance:g}"] = sum(finding.near for finding in findings)
     if findings[0].unrepaired_pairs:
-        counts["collisions of meshes that cross at the first frame"] = sum(
-            finding.unrepaired_hits for finding in findings
-        )
+        number = sum(finding.unrepaired_hits for finding in findings)
+        counts["collisions of meshes that cross at the first frame"] = number
+    if any(finding.inverted is not None for finding in findings):
+        counts[INVERTED] = sum(finding.inverted or 0 for finding in findings)
     return counts
 
 
@@ -87,8 +91,10 @@ def kept_meshes(scene: Scene, keep: Iterable[str] = ()) -> dict[str, str]:
         ValueError: If a pattern matches no mesh.
     """
     kept = dict.fromkeys(matching_meshes(scene, keep, "keep"), "it is to be kept")
-    reasons = {prim.name: prim.why_not_repaired for prim in map(scene.prim_of, scene.names) if prim.why_not_repaired}
-    return reasons | kept
+    prims = [scene.prim_of(name) for name in scene.names]
+    is_still = scene.is_still and not any(prim.times for prim in prims)  # all may be moved then
+    reasons = {prim.name: prim.why_not_written if is_still else prim.why_not_repaired for prim in prims}
+    return {name: why for name, why in reasons.items() if why} | kept
 
 
 def matching_meshes(scene: Scene, patterns: Iterable[str], what: str) -> list[str]:
@@ -155,11 +161,11 @@ def _find_collisions(results, selection, kept, unrepaired, min_distance, device)
         start, end = ({p: n for p, n in at.mesh_pairs.items() if not kept >= {*p}} for at in summary.intersections)
         hits = {pair: number for pair, number in summary.mesh_pairs.items() if not kept >= {*pair}}
         if unrepaired is None:
-            unrepaired = frozenset(_sorted(p) for p, (crosses, _) in start.items() if crosses and p[0] != p[1])
+            unrepaired = frozenset(tuple(sorted(p)) for p, (crosses, _) in start.items() if crosses and p[0] != p[1])
         if last is None and min_distance:
             selection = replace(selection, ignored_names=selection.ignored_names | unrepaired)
             near_pairs = _NearPairs(selection, kept, min_distance, device)
-        is_unrepaired = {pair: _sorted(pair) in unrepaired for pair in (*start, *end, *hits)}
+        is_unrepaired = {pair: tuple(sorted(pair)) in unrepaired for pair in (*start, *end, *hits)}
         is_joined = interval.segment is last and not interval.jumps
         near = near_pairs.find(interval, is_joined) if near_pairs else (0, 0)
         counted, unrepaired_hits = (sum(hits[p] for p in hits if is_unrepaired[p] == which) for which in (False, True))
@@ -175,12 +181,9 @@ def _find_collisions(results, selection, kept, unrepaired, min_distance, device)
             unrepaired_hits=unrepaired_hits,
             kept_hits=sum(summary.mesh_pairs.values()) - counted - unrepaired_hits,
             ignored_pairs=tuple(summary.ignored),
+            inverted=sum(f.number for f in summary.inverted) if interval.segment.tetrahedra.names else None,
         )
         last = interval.segment
-
-
-def _sorted(pair: MeshPair) -> MeshPair:
-    return min(pair), max(pair)
 
 
 class _NearPairs:
@@ -210,6 +213,4 @@ class _NearPairs:
         """Returns a number for each pair that is too near on the way to some positions, int64."""
         found = self._detector.detect(interval.x0, end)
         (contacts,) = find_contacts([interval], self._mesh, found, self._selection)
-        vertex_face, edge_edge = (pairs.astype(np.int64) @ _KEY for pairs in (found.vertex_face, found.edge_edge))
-        keys = np.concatenate([vertex_face, -1 - edge_edge])[contacts.counted]
-        return keys[~self._is_kept[contacts.meshes].all(axis=1)]
+        return keys_of(found)[contacts.counted][~self._is_kept[contacts.meshes].all(axis=1)]

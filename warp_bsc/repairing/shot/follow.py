@@ -76,24 +76,21 @@ class Follower:
         rigid: np.ndarray | None = None,
         min_distance: float = 0.0,
     ):
-        """Makes the stages.
+        """Prepares detection.
 
         Args:
             mesh: The mesh. Pairs that its groups and masks leave out are not kept apart.
-            x: Positions at the start, float, shape [vertex_count, 3].
-            is_movable: Whether each vertex may be displaced, bool, shape [vertex_count]. The others are obstacles and
-                move as given.
+            x: Positions at the start, float32, shape [vertex_count, 3].
+            is_movable: Whether each vertex may be displaced, bool, shape [vertex_count]; others move as given.
             rigid: Group of each vertex that keeps the shape it has in the given positions, -1 for none, int, shape
                 [vertex_count]; default: none.
             min_distance: Distance that pairs keep, see :class:`warp_bsc.SolverCCD`.
         """
         self.mesh, self._is_movable, self._device = mesh, is_movable, mesh.device
-        edges = mesh.edges[is_movable[mesh.edges].all(axis=1)].astype(np.int64)
+        self.edges = edges = mesh.edges[is_movable[mesh.edges].all(axis=1)].astype(np.int64)
         lengths = np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1)
         self.length = float(np.median(lengths)) if len(lengths) else 1.0
-        self.edges = edges
-        self._rigid = rigid
-        self._x, self._min_distance = np.asarray(x, np.float32), min_distance
+        self._rigid, self._x, self._min_distance = rigid, x, min_distance
         self._gaps = {CollisionDetector(mesh): _GAP * self.length}
         if min_distance:
             detector = CollisionDetector(mesh, min_distance=min_distance)
@@ -142,8 +139,8 @@ class Follower:
             x = x.astype(np.float32)
             contacts, touched = self._contacts(start, x, changed, arcs)
             is_free = not touched.any()
-            unspread = float(np.linalg.norm(x.astype(np.float64) - target, axis=1).max(initial=0.0))
             if is_free:
+                unspread = float(np.linalg.norm(x.astype(np.float64) - target, axis=1).max(initial=0.0))
                 if best is None or unspread < best[0]:
                     best = unspread, ShotFrame(given, x, displacement, True, known, arcs)
                 if unspread < tolerance or not sweeps:
@@ -161,9 +158,8 @@ class Follower:
                 target = _displaced(given, displacement)
                 x = self._moved_apart(target, given, known)
             changed = touched | (x.astype(np.float32) != last).any(axis=1)
-        frame = ShotFrame(given, target, displacement, False, known, arcs) if best is None else best[1]
-        if frame.certified:
-            return frame
+        if best is not None:
+            return best[1]
         x, certified = self._playback.step(start, x.astype(np.float32))
         if certified and arcs is not None:  # the stage knows the chords alone
             _, touched = self._contacts(start, x, self._is_movable, arcs)
@@ -219,26 +215,19 @@ class Follower:
         return float(strains.max(initial=0.0)), float(np.maximum(strains - 0.5 * _STRAINED, 0.0).sum())
 
     def near(self, contacts: Contacts, x: np.ndarray) -> Contacts:
-        """Returns the contacts of which the elements are still near each other at positions, with directions there.
+        """Returns the contacts of a frame whose elements are still near each other at its end, with directions there.
 
-        Args:
-            contacts: Contacts of a frame.
-            x: The positions at its end, which are free, float32, shape [vertex_count, 3].
+        ``x`` are the positions at its end, which are free, float32, shape [vertex_count, 3].
         """
-        contacts = contacts.latest()
         at = self.mesh.device_positions(x, "x")
-        contacts = self._directed(contacts, at, at)
-        distance = np.einsum(
-            "ik,ikj,ij->i", contacts.weights, x[contacts.vertices].astype(np.float64), contacts.normals
-        )
+        contacts = self._directed(contacts.latest(), at, at)
+        ends = x[contacts.vertices].astype(np.float64)
+        distance = np.einsum("ik,ikj,ij->i", contacts.weights, ends, contacts.normals)
         are_near = (distance > 0.0) & (distance < self._min_distance + _REACH * self.length)
         return replace(contacts, gap=np.minimum(contacts.gap, distance)).rows(are_near)
 
     def _moved_apart(self, x, given, known: Contacts, moving=None) -> np.ndarray:
-        """Returns positions with contacts moved apart and rigid groups as they are in given ones.
-
-        They are float64, or as they are if nothing moves.
-        """
+        """Returns positions, float64 or ``x`` itself, with contacts moved apart and rigid groups as in given ones."""
         movable, groups = self._is_movable if moving is None else moving, self._surface.rigid
         vertices = groups.vertices
         for _ in range(_FITS if len(vertices) else 1):
@@ -266,9 +255,9 @@ class Follower:
         contacts = Contacts.joined(found)
         if arcs is None:
             return self._directed(contacts, x0, x1), touched
-        turning = _turns(contacts, arcs)
+        turning = np.any(arcs.body[contacts.vertices] >= 0, axis=1)
         straight = self._directed(contacts.rows(~turning), x0, x1)
-        return _on_arcs(Contacts.joined([straight, contacts.rows(turning)]), arcs, start, target), touched
+        return Contacts.joined([straight, _on_arcs(contacts.rows(turning), arcs, start, target)]), touched
 
     def _directed(self, contacts: Contacts, x0: wp.array, x1: wp.array) -> Contacts:
         """Returns contacts of a motion with the closest points, and the directions between them, a moment before.
@@ -303,7 +292,6 @@ class Follower:
 
     @functools.cached_property
     def _playback(self) -> "Playback":
-        """The stage behind a solver that moves particles to given positions."""
         from .playback import Playback  # noqa: PLC0415 (Newton takes seconds, and few shots need it)
 
         return Playback(self.mesh, self._x, self._is_movable, self._min_distance)
@@ -323,31 +311,22 @@ class Follower:
         return spread
 
 
-def _turns(contacts: Contacts, arcs: RigidMotion) -> np.ndarray:
-    """Returns which contacts have a vertex that turns, bool, shape [n]."""
-    return np.any(arcs.body[contacts.vertices] >= 0, axis=1)
-
-
 def _on_arcs(contacts: Contacts, arcs: RigidMotion, x0: np.ndarray, x1: np.ndarray) -> Contacts:
-    """Returns contacts of a motion with the distances that those with a turning vertex are to have at its end.
+    """Returns contacts of a motion with a turning vertex, with the distances that they are to have at its end.
 
     At the time of a contact on an arc the chords may be apart. Where the elements are nearest on the rest of the way,
     along the normal, the movable side is to be farther: as it moves straight, it ends farther by that over the time.
     """
-    turning = _turns(contacts, arcs)
-    rows = contacts.rows(turning)
+    gap, toi = contacts.gap, contacts.toi
 
     def distances(time: np.ndarray) -> np.ndarray:
-        at = points_on_arcs(arcs, x0, x1, rows.vertices, time[:, None])
-        return np.einsum("ik,ikj,ij->i", rows.weights, at, rows.normals)
+        at = points_on_arcs(arcs, x0, x1, contacts.vertices, time[:, None])
+        return np.einsum("ik,ikj,ij->i", contacts.weights, at, contacts.normals)
 
-    needed = rows.gap / np.maximum(rows.toi, _EARLIEST)
-    for share in np.linspace(0.0, 1.0, _TIMES):
-        time = rows.toi + share * (1.0 - rows.toi)
-        needed = np.maximum(needed, (rows.gap - distances(time)) / np.maximum(time, _EARLIEST))
-    gap = contacts.gap.copy()
-    gap[turning] = np.maximum(rows.gap, distances(np.ones(len(rows.toi))) + needed)
-    return replace(contacts, gap=gap)
+    needed = gap / np.maximum(toi, _EARLIEST)
+    for time in (toi + share * (1.0 - toi) for share in np.linspace(0.0, 1.0, _TIMES)):
+        needed = np.maximum(needed, (gap - distances(time)) / np.maximum(time, _EARLIEST))
+    return replace(contacts, gap=np.maximum(gap, distances(np.ones(len(toi))) + needed))
 
 
 def _displaced(given, displacement) -> np.ndarray:

@@ -15,7 +15,7 @@ from ...usd.write.points_layer import MovedFrame
 from .findings import Finding
 from .stretch import RepairedStretch
 
-_FORMAT = "warp-bsc repair 2"
+_FORMAT = "warp-bsc repair 3"
 
 
 class Journal:

@@ -17,12 +17,8 @@ def groups_of(
     """Returns the groups and the masks of vertices that leave pairs of meshes out, uint32; None if there are none.
 
     Meshes that meet the same others are of one kind, which is a group. A vertex of two meshes has the groups of both:
-    its elements meet what their other vertices meet.
-
-    Args:
-        segment: The meshes.
-        kept: Names of meshes that do not meet each other or themselves.
-        pairs: Names of pairs of meshes that do not meet, twice the same name for a mesh that does not meet itself.
+    its elements meet what their other vertices meet. Meshes whose names are ``kept`` do not meet each other or
+    themselves, nor do given pairs meet, twice the same name for a mesh with itself.
 
     Raises:
         ValueError: If there are more than 32 kinds.

@@ -16,14 +16,7 @@ class Playback:
     """The stage behind a solver that moves the vertices of a mesh to given positions."""
 
     def __init__(self, mesh: CollisionMesh, x: np.ndarray, is_movable: np.ndarray, min_distance: float):
-        """Makes the model.
-
-        Args:
-            mesh: The mesh, with its groups and masks.
-            x: Positions at the start, float32, shape [vertex_count, 3].
-            is_movable: Whether the stage may move each vertex, bool, shape [vertex_count].
-            min_distance: Distance that pairs keep.
-        """
+        """Makes the model of a mesh at ``x``, float32, shape [vertex_count, 3], with its groups, masks and distance."""
         builder = newton.ModelBuilder()
         builder.add_particles(x.tolist(), np.zeros_like(x).tolist(), is_movable.astype(float).tolist())
         builder.add_triangles(*mesh.faces.astype(np.int64).T.tolist())
@@ -38,9 +31,7 @@ class Playback:
     def step(self, start: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, bool]:
         """Returns the positions that the stage makes of a motion, and whether it certifies the motion to them.
 
-        Args:
-            start: Positions at the start, float32, shape [vertex_count, 3].
-            target: Positions at the end of the motion, likewise.
+        All positions are float32, shape [vertex_count, 3].
         """
         assert self._start.particle_q is not None and self._end.particle_q is not None
         self._start.particle_q.assign(start)
@@ -55,11 +46,7 @@ class Playback:
 
 
 class _Given(SolverBase):
-    """A solver that moves particles to given positions.
-
-    Attributes:
-        target: The positions, float32, shape [particle_count, 3].
-    """
+    """A solver that moves particles to given positions, float32, shape [particle_count, 3]."""
 
     target: np.ndarray
 

@@ -1,6 +1,7 @@
 """Repairs a shot: its meshes follow it, and leave it where it collides, before and after that as little as needed."""
 
-from collections.abc import Callable, Iterable, Iterator
+import itertools
+from collections.abc import Callable, Container, Iterable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -9,9 +10,10 @@ import numpy as np
 from ..._arguments import check_instance, checked_distance, checked_integer
 from ...detection.arcs.rigid_motion import RigidMotion
 from ...detection.at_rest.body_parts import connect_cells
+from ...detection.detector import CollisionDetector
 from ...detection.mesh import CollisionMesh
 from ...scene_replay.scene_arcs import arcs_of
-from ...usd.interval import Interval
+from ...usd.interval import Interval, times_in_words
 from ...usd.scene import Scene
 from ...usd.segment import Segment
 from ...usd.write.points_layer import MovedFrame
@@ -20,6 +22,7 @@ from ..repair import repair
 from .blend import MARGIN, blend
 from .findings import Finding, kept_meshes, matching_meshes
 from .follow import Follower
+from .insides import Insides, Moment
 from .mesh_groups import groups_of
 from .stretch import RepairedStretch, ShotFrame, StretchRecorder
 
@@ -130,8 +133,7 @@ class _Shot:
     def repair(self, first: int, stop: int, max_move: float | None) -> tuple[RepairedStretch | None, int]:
         """Follows the shot twice through a stretch, and further until it is reached again.
 
-        Returns:
-            The stretch, None if nothing of it can be moved, and the interval after it.
+        Returns the stretch, None if nothing of it can be moved, and the interval after it.
         """
         interval = self._take_segment(first)
         last = self._span(first)[1]
@@ -139,24 +141,23 @@ class _Shot:
             return None, stop
         reasons = []
         start = self._start(first, interval, reasons)
-        sought = [_nonzero(start.displacement)]
         contacts: dict[int, Contacts] = {}
-        for frame in self._follow(first, stop, last, start, contacts):
-            sought.append(_nonzero(frame.displacement))
+        frames = itertools.chain([start], self._follow(first, stop, last, start, contacts))
+        sought = [_nonzero(frame.displacement) for frame in frames]
         stop = min(last, max(stop, first + len(sought) - 1 + MARGIN))
         used, displacements = _joined(sought, stop - first + 1)
         recorder = self._recorder()
         frame, number = start, 0
-        self._record(recorder, first, start, 0)
         frames = self._follow(first, stop, last, start, contacts, used, blend(displacements))
-        for number, frame in enumerate(self._relaxed(start, frames), 1):
+        frames, held = self._with_insides(first, itertools.chain([start], self._relaxed(start, frames)), reasons)
+        for number, frame in enumerate(frames):
             self._record(recorder, first, frame, number)
         stop = first + number
         is_free = all(finding.is_free for finding in self._findings[max(first, stop - 2 * MARGIN) : stop])
         if is_free and frame.differs:
             time = self._scene.times[stop]
             reasons.append(f"the meshes have not returned to the shot at time {time:g}, where it ends or jumps")
-        stretch = recorder.finish(reasons)
+        stretch = recorder.finish(reasons, held)
         if max_move is not None and stretch.largest_move > max_move:
             reason = f"kept as it is: a move of {stretch.largest_move:g} is needed, more than {max_move:g}"
             recorder = self._recorder()
@@ -178,12 +179,7 @@ class _Shot:
         segment = self._scene.segment(index)
         if segment is not self._segment:
             self._segment = segment
-            is_movable = np.zeros(segment.vertex_count, dtype=bool)
-            are_kept = [mesh.name in self._kept for mesh in segment.meshes]
-            for is_given in (True, False):  # a vertex of two meshes is kept if one of them is
-                for number, is_kept in enumerate(are_kept):
-                    if is_kept != is_given:
-                        is_movable[segment.vertices_of(number)] = is_given
+            self._is_movable = is_movable = ~_are_of(segment, self._kept)
             group, mask = groups_of(segment, self._kept.keys(), self._passing)
             # The same for all stretches of the segment, wherever a run begins.
             x = segment.start_positions
@@ -191,14 +187,14 @@ class _Shot:
             self._is_single = x.dtype == np.float32
             self._origin = np.zeros(3) if self._is_single else x.mean(axis=0)
             mesh = CollisionMesh(segment.faces, len(x), group=group, mask=mask, device=self._device)
-            self._rigid = np.full(len(x), -1)
-            hard = [segment.vertices_of(n) for n, found in enumerate(segment.meshes) if found.name in self._hard]
-            if hard:
-                vertices = np.concatenate(hard)
-                self._rigid[vertices] = connect_cells(mesh.edges, len(x))[vertices]
-            options: dict[str, Any] = {"rigid": self._rigid, "min_distance": self._min_distance}
-            self._follower = Follower(mesh, self._single(x), is_movable, **options)
-            self._is_movable = is_movable
+            pieces = connect_cells(mesh.edges, len(x)) if self._hard else -1
+            self._rigid = rigid = np.where(_are_of(segment, self._hard), pieces, -1)
+            self._follower = Follower(mesh, self._single(x), is_movable, rigid=rigid, min_distance=self._min_distance)
+            self._insides = None
+            if any(name not in self._kept for name in segment.tetrahedra.names):
+                given, _ = self._scene.interval(index).tet_positions
+                options: dict[str, Any] = {"rigid": self._hard, "device": self._device}
+                self._insides = Insides(self._scene, segment, is_movable, given, self._origin, **options)
         return self._scene.interval(index)
 
     def _single(self, x) -> np.ndarray:
@@ -230,23 +226,20 @@ class _Shot:
         return ShotFrame(given, x, x - given)
 
     def _follow(self, first, stop, last, start, contacts, used=None, displacements=None) -> Iterator[ShotFrame]:
-        """Yields the frames of a stretch after its first.
+        """Yields the frames of a stretch after its first one, until the shot is reached at ``stop`` or later.
 
-        Args:
-            first: Number of the first interval.
-            stop: Number of the interval after the last; more are followed until the shot is reached.
-            last: Number of the interval at which the segment ends, or its meshes jump.
-            start: The first frame.
-            contacts: Contacts by interval: written while displacements are sought, and known from the start later.
-            used: Vertices that are displaced.
-            displacements: Their displacements at each frame, shape [frames, n, 3]; None where they are sought, and fade
-                from frame to frame.
+        At ``last`` the segment ends, or its meshes jump. Without ``displacements`` of the vertices ``used`` at each
+        frame, shape [frames, n, 3], these are sought, and fade from frame to frame. ``contacts`` by interval are
+        written then, and known from the start later.
         """
         frame, known = start, Contacts.none()
         for index in range(first, last):
             if index >= stop and not frame.differs:
                 break
             interval = self._scene.interval(index)
+            if interval.is_at_rest:  # the first frame, which is repaired by itself
+                yield frame
+                continue
             given, arcs = self._single(interval.x1), self._arcs(interval)
             if displacements is None:
                 displacement = _FADING * frame.displacement
@@ -256,26 +249,21 @@ class _Shot:
                 displacement = np.zeros_like(given)
                 if index - first + 1 < len(displacements):
                     displacement[used] = displacements[index - first + 1]
-            if self._findings[index].is_free and not frame.differs and not displacement.any():
+            is_free, follow = self._findings[index].is_free, self._follower.follow
+            if is_free and not frame.differs and not displacement.any():
                 frame, known = ShotFrame.of_shot(given, arcs), Contacts.none()
             else:
+                free_start = frame.given if is_free and self._is_single else None
+                options: dict[str, Any] = {"arcs": arcs, "free_start": free_start}
                 if displacements is None:
-                    known, tolerance = self._follower.near(known, frame.x), _SOUGHT
-                else:
-                    known, tolerance = contacts.get(index, Contacts.none()), _ACCEPTED
-                is_free = self._findings[index].is_free and self._is_single
-                found = self._follower.follow(
-                    frame.x,
-                    given,
-                    displacement,
-                    tolerance=tolerance,
-                    known=known,
-                    free_start=frame.given if is_free else None,
-                    arcs=arcs,
-                )
-                if displacements is None:
+                    known = self._follower.near(known, frame.x)
+                    found = follow(frame.x, given, displacement, tolerance=_SOUGHT, known=known, **options)
                     known = contacts[index] = found.contacts
-                added = found.displacement if displacements is None else found.x - given
+                    added = found.displacement
+                else:
+                    known = contacts.get(index, Contacts.none())
+                    found = follow(frame.x, given, displacement, tolerance=_ACCEPTED, known=known, **options)
+                    added = found.x - given
                 frame = replace(found, displacement=added.astype(np.float32))
             yield frame
 
@@ -293,6 +281,34 @@ class _Shot:
                 yield window[0]
         yield from window[1:]
 
+    def _with_insides(self, first, frames, reasons) -> tuple[Iterable[ShotFrame], tuple[str, ...]]:
+        """Returns frames from that at the start of an interval on with what moves inside tetrahedra.
+
+        Also returns the meshes of which parts are moved less, which ``reasons`` get as well.
+        """
+        if self._insides is None:
+            return frames, ()
+        frames = list(frames)
+        starts = [first, *range(first, first + len(frames) - 1)]
+        given = [self._scene.interval(index).tet_positions[number > 0] for number, index in enumerate(starts)]
+        moments = [self._moment(first, number) for number in range(len(frames))]
+        frames, held = self._insides.follow(frames, given, moments)
+        if held and self._scene.interval(first).is_at_rest:  # then it does not cross more than it did
+            finder, (frame, *_) = CollisionDetector(self._follower.mesh), frames
+            if len(finder.find_intersections(frame.x)) > len(finder.find_intersections(frame.given)):
+                frames = [ShotFrame.of_shot(frame.given)] * len(frames)
+        reasons += [
+            f"{name} is moved less than contacts need {times_in_words(times)}, as its tetrahedra would invert"
+            for name, times in held.items()
+        ]
+        return frames, tuple(held)
+
+    def _moment(self, first, number) -> Moment:
+        """Returns the moment of the frame of a number, counted from that at the start of the first interval."""
+        index = first + number
+        before = number > 0 and index < len(self._findings) and not self._findings[index].is_joined
+        return self._scene.times[index], before
+
     def _recorder(self) -> StretchRecorder:
         return StretchRecorder(self._is_movable, self._follower.edges, self._follower.length)
 
@@ -300,10 +316,17 @@ class _Shot:
         """Adds the frame of a number, counted from that at the start of the first interval, to a stretch."""
         assert self._segment is not None
         (vertices,) = np.nonzero((frame.x != frame.given).any(axis=1))
-        index = first + number
-        before = number > 0 and index < len(self._findings) and not self._findings[index].is_joined
         x = frame.x[vertices].astype(np.float64) + self._origin
-        recorder.add(frame, MovedFrame(self._scene.times[index], before, self._segment, vertices, x))
+        vertices, x = np.append(vertices, len(frame.x) + frame.inner.numbers), np.concatenate([x, frame.inner.x])
+        recorder.add(frame, MovedFrame(*self._moment(first, number), self._segment, vertices, x))
+
+
+def _are_of(segment: Segment, names: Container[str]) -> np.ndarray:
+    """Returns whether each vertex is of a mesh, or of one of several meshes, of some names, bool, shape [n]."""
+    found = np.zeros(segment.vertex_count, dtype=bool)
+    for number, mesh in enumerate(segment.meshes):
+        found[segment.vertices_of(number)] |= mesh.name in names
+    return found
 
 
 def _nonzero(displacement) -> tuple[np.ndarray, np.ndarray]:

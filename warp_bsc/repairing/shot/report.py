@@ -1,6 +1,5 @@
 """Writes a page that shows a repaired shot before and after, frame by frame, in one file that needs no network."""
 
-import os
 from collections.abc import Callable, Iterable
 from importlib import resources
 from itertools import pairwise
@@ -18,90 +17,61 @@ from ...usd.write.points_layer import MovedFrame
 from .findings import Finding, count_found
 from .stretch import RepairedStretch, distortion
 
-_ALL_FACES = (
-    3_000_000  # about 25 MB, in the views of all frames together; divided by their number, the limit of a frame ...
-)
-_FEWEST_FACES, _MOST_FACES = 2_000, 150_000  # ... within these bounds
+_ALL_FACES = 3_000_000  # about 25 MB, in the views of all frames together: divided by their number, the most of a frame
+_FEWEST_FACES, _MOST_FACES = 2_000, 150_000  # within these bounds
 _MOST_VIEWS = 1_500  # frames with a view
 _STEPS = 1 << 16  # positions in the shot are rounded to this part of the size of what is shown
 _MAX_ROWS = 200
 
 
-class RepairPage:
-    """A page with a timeline, moved frames in 3D before and after, and the stretches.
+def write_page(
+    file: OutputFile,
+    scene: Scene,
+    *,
+    stretches: Callable[[], Iterable[RepairedStretch]],
+    before: list[Finding],
+    after: list[Finding] | None,
+    kept: dict[str, str],
+    min_distance: float = 0.0,
+    stopped: str = "",
+) -> None:
+    """Writes a page with a timeline, moved frames in 3D before and after, and the stretches, and moves it to its path.
 
-    Attributes:
+    Args:
         file: The file.
+        scene: The scene that was repaired.
+        stretches: Returns its stretches with their frames, in order; called twice.
+        before: What a replay has found in it.
+        after: What a replay has found in the layer, None if that was not replayed.
+        kept: Reasons of the meshes that are not moved, by name.
+        min_distance: Distance that was to be kept, in the scene's unit of length.
+        stopped: Why the repair was stopped, in words; empty if it was not.
+
+    Raises:
+        OSError: If the disk is full.
+        ValueError: If the scene cannot be read again.
     """
-
-    def __init__(self, path: str | os.PathLike):
-        """Opens the file.
-
-        Raises:
-            OSError: If it cannot be written.
-        """
-        self.file = OutputFile(path)
-
-    def write(
-        self,
-        scene: Scene,
-        *,
-        stretches: Callable[[], Iterable[RepairedStretch]],
-        before: list[Finding],
-        after: list[Finding] | None,
-        kept: dict[str, str],
-        min_distance: float = 0.0,
-        stopped: str = "",
-    ) -> None:
-        """Writes the page and moves it to its path.
-
-        Args:
-            scene: The scene that was repaired.
-            stretches: Returns its stretches with their frames, in order; called twice.
-            before: What a replay has found in it.
-            after: What a replay has found in the layer, None if that was not replayed.
-            kept: Reasons of the meshes that are not moved, by name.
-            min_distance: Distance that was to be kept, in the scene's unit of length.
-            stopped: Why the repair was stopped, in words; empty if it was not.
-
-        Raises:
-            OSError: If the disk is full.
-            ValueError: If the scene cannot be read again.
-        """
-        page = resources.files("warp_bsc.repairing.shot") / "page"
-        shared = (shared_part(name) for name in ("blocks.js", "elements.js", "view3d.js"))
-        head, between, end = fill_page(page / "page.html", [*shared, page / "repair.js"], _title(scene))
-        self.file.write(head)
-        summary = _Summary(scene, stretches())
-        views = _Views(scene, summary)
-        number = 0
-        for stretch in stretches():
-            for moved in stretch.frames:
-                if number in views.numbers:
-                    for text in views.of(moved, number):
-                        self.file.write(text)
-                number += 1
-        data = summary.data(before, after, kept, min_distance)
-        data["partial"] = f"Partial: {stopped}. The layer has not been replayed." if stopped else ""
-        data["notes"] += views.notes()
-        for index, frame in enumerate(data["frames"]):
-            frame["view"] = index if index in views.numbers else None
-        self.file.write(between + inert(data) + end)
-        self.file.commit()
-
-    def discard(self) -> None:
-        """Removes the temporary file."""
-        self.file.discard()
+    page = resources.files("warp_bsc.repairing.shot") / "page"
+    shared = (shared_part(name) for name in ("blocks.js", "elements.js", "view3d.js"))
+    head, between, end = fill_page(page / "page.html", [*shared, page / "repair.js"], _title(scene))
+    file.write(head)
+    summary = _Summary(scene, stretches())
+    views = _Views(scene, summary)
+    for number, moved in enumerate(frame for stretch in stretches() for frame in stretch.frames):
+        if number in views.numbers:
+            for text in views.of(moved, number):
+                file.write(text)
+    data = summary.data(before, after, kept, min_distance)
+    data["partial"] = f"Partial: {stopped}. The layer has not been replayed." if stopped else ""
+    data["notes"] += views.notes()
+    for index, frame in enumerate(data["frames"]):
+        frame["view"] = index if index in views.numbers else None
+    file.write(between + inert(data) + end)
+    file.commit()
 
 
 class _Summary:
-    """The numbers of a repair, and the vertices that it moved.
-
-    Attributes:
-        frames: The moved frames, for the page.
-        moved: Vertices that are moved at some time, bool, by the number of their segment.
-        segments: The segments with moved frames, in order.
-    """
+    """The numbers of a repair and its moved frames; by segment, whether each vertex is moved at some time."""
 
     def __init__(self, scene: Scene, stretches: Iterable[RepairedStretch]):
         self._scene = scene
@@ -118,13 +88,13 @@ class _Summary:
                 if not self.segments or frame.segment is not self.segments[-1]:
                     self.segments.append(frame.segment)
                     self.moved.append(np.zeros(frame.segment.vertex_count, dtype=bool))
-                self.moved[-1][frame.vertices] = True
+                self.moved[-1][frame.vertices[frame.vertices < frame.segment.vertex_count]] = True
             self._stretches.append(stretch)
 
     def data(
         self, before: list[Finding], after: list[Finding] | None, kept: dict[str, str], min_distance: float
     ) -> dict[str, Any]:
-        """Returns what the page's script shows beside the views; arguments are those of :meth:`RepairPage.write`."""
+        """Returns what the page's script shows beside the views; arguments are those of :func:`write_page`."""
         scene, stretches = self._scene, self._stretches
         unit = max((stretch.edge_length for stretch in stretches), default=1.0)
         largest = max((frame["move"] for frame in self.frames), default=0.0)
@@ -194,11 +164,9 @@ class _Summary:
 
 
 class _Views:
-    """The blocks of the moved frames: triangles, positions in the shot, and displacements.
+    """The blocks of the moved frames that have a view: triangles, positions in the shot, and displacements.
 
-    Attributes:
-        numbers: The frames that have a view: all, or some, spread evenly, and the worst: the most distorted one, or
-            the one with the largest move.
+    These are all, or some, spread evenly, and the worst: the most distorted one, or the one with the largest move.
     """
 
     def __init__(self, scene: Scene, summary: _Summary):
@@ -212,21 +180,17 @@ class _Views:
         self._faces = [
             _faces_to_show(segment, moved, most) for segment, moved in zip(summary.segments, summary.moved, strict=True)
         ]
-        self._written: set[int] = set()
         self._segment, self._number = None, -1
         self._meshes = {name: number for number, name in enumerate(scene.names)}
         self._center: np.ndarray | None = None
 
     def of(self, moved: MovedFrame, number: int) -> list[str]:
         """Returns the blocks of a frame, with its number among all."""
-        segment = moved.segment
-        if segment is not self._segment:
-            self._segment, self._number = segment, self._number + 1
-        faces = self._faces[self._number]
-        vertices, corners = np.unique(segment.faces[faces], return_inverse=True)
+        segment, is_new = moved.segment, moved.segment is not self._segment
+        self._segment, self._number = segment, self._number + is_new
+        vertices, corners = np.unique(segment.faces[self._faces[self._number]], return_inverse=True)
         texts = []
-        if self._number not in self._written:
-            self._written.add(self._number)
+        if is_new:
             names = [segment.meshes[mesh].name for mesh in segment.locate_vertices(vertices)[0]]
             meshes = np.array([self._meshes[name] for name in names], dtype=np.int64)
             texts.append(block(f"faces-{self._number}", {}, {"faces": corners, "mesh_of_vertex": meshes}))
@@ -268,8 +232,7 @@ class _Views:
 
 def _faces_to_show(segment: Segment, moved: np.ndarray, most: int) -> np.ndarray:
     """Returns the faces that a page shows: all, or those around vertices that are moved at some time."""
-    x = segment.start_positions
-    (lit,) = np.nonzero(moved[segment.faces].any(axis=1))
+    x, lit = segment.start_positions, np.flatnonzero(moved[segment.faces].any(axis=1))
     return choose_faces(x[segment.faces[:, 0]], x[moved], lit, most)
 
 

@@ -1,6 +1,7 @@
 """A repaired stretch of a shot: its moved vertices, and how far they moved, in numbers."""
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -35,6 +36,7 @@ class RepairedStretch:
             in the shot, in the unit of length.
         uncertified: Times of the frames whose motion from the frame before is not certified.
         reasons: Why collisions remain, in words; empty where none should be.
+        held: Names of the meshes that are moved less somewhere, as their tetrahedra would invert.
     """
 
     start: float
@@ -49,6 +51,7 @@ class RepairedStretch:
     acceleration: tuple[float, float]
     uncertified: tuple[float, ...]
     reasons: tuple[str, ...]
+    held: tuple[str, ...] = ()
 
     @property
     def edge_ratio(self) -> tuple[float, float]:
@@ -60,6 +63,14 @@ class RepairedStretch:
         """Returns smallest and largest lengths of edges in frames that are not good, by their times."""
         rows = zip(self.frames, self.edge_ratios, strict=True)
         return {frame.time: ends for frame, ends in rows if ends[0] < _GOOD_EDGES[0] or ends[1] > _GOOD_EDGES[1]}
+
+
+class InnerVertices(NamedTuple):
+    """Moved vertices of tetrahedra inside surfaces: numbers, positions in world space, and distances from the shot."""
+
+    numbers: np.ndarray = np.zeros(0, dtype=int)
+    x: np.ndarray = np.zeros((0, 3))
+    moves: np.ndarray = np.zeros(0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +85,7 @@ class ShotFrame:
             distance.
         contacts: The contacts that are kept apart there.
         arcs: The obstacles that turn on the way to it, and how; None if all move straight.
+        inner: What moves inside the surfaces of tetrahedra.
     """
 
     given: np.ndarray
@@ -82,6 +94,7 @@ class ShotFrame:
     certified: bool = True
     contacts: Contacts = field(default_factory=Contacts.none)
     arcs: RigidMotion | None = None
+    inner: InnerVertices = field(default_factory=InnerVertices)
 
     @staticmethod
     def of_shot(given: np.ndarray, arcs: RigidMotion | None = None) -> "ShotFrame":
@@ -104,7 +117,7 @@ class StretchRecorder:
         self._times: list[float] = []
         self._uncertified: list[float] = []
         self._largest: list[float] = []
-        self._moved, self._sum, self._count = 0, 0.0, 0
+        self._sum = 0.0
         self._ratios: list[tuple[float, float]] = []
         self._last: list[tuple[np.ndarray, np.ndarray]] = []  # displacements and positions of the last two frames
         self._acceleration = 0.0, 0.0
@@ -124,28 +137,30 @@ class StretchRecorder:
         if not len(moved.vertices):
             return
         self._frames.append(moved)
-        moves = np.linalg.norm(added[moved.vertices], axis=1)
-        self._moved = max(self._moved, len(moves))
+        moves = np.linalg.norm(added[moved.vertices[moved.vertices < len(added)]], axis=1)
+        moves = np.append(moves, frame.inner.moves)
         self._largest.append(float(moves.max()))
-        self._sum, self._count = self._sum + float(moves.sum(dtype=np.float64)), self._count + len(moves)
+        self._sum += float(moves.sum(dtype=np.float64))
         ratio = edge_ratios(frame, self._edges, self._length)
         self._ratios.append((float(ratio.min(initial=1.0)), float(ratio.max(initial=1.0))))
 
-    def finish(self, reasons: list[str]) -> RepairedStretch:
-        """Returns the stretch; ``reasons`` say why collisions remain."""
+    def finish(self, reasons: list[str], held: tuple[str, ...] = ()) -> RepairedStretch:
+        """Returns the stretch; ``reasons`` and ``held`` are those of :class:`RepairedStretch`."""
+        counts = [len(frame.vertices) for frame in self._frames]
         return RepairedStretch(
             start=self._times[0],
             end=self._times[-1],
             frames=tuple(self._frames),
             largest_moves=tuple(self._largest),
-            moved=self._moved,
+            moved=max(counts, default=0),
             largest_move=max(self._largest, default=0.0),
-            mean_move=self._sum / max(1, self._count),
+            mean_move=self._sum / max(1, sum(counts)),
             edge_length=self._length,
             edge_ratios=tuple(self._ratios),
             acceleration=(self._acceleration[0], self._acceleration[1]),
             uncertified=tuple(self._uncertified),
             reasons=tuple(reasons),
+            held=held,
         )
 
 

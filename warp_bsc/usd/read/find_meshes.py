@@ -31,11 +31,8 @@ def find_meshes(
     finder.walk(iter(Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies())))
     selection.check_patterns(finder.found)
 
-    meshes, invisible, empty, unselected, warnings = [], [], [], Counter(), []
-    for name, unmatched in selection.unmatched(finder.found).items():
-        if unmatched:
-            first = " ".join(unmatched[0])
-            warnings.append(f"{name}: entries that match no meshes: {len(unmatched)}, the first is {first}")
+    meshes, invisible, empty, unselected = [], [], [], Counter()
+    warnings = selection.unmatched(finder.found)
     first_instances: dict[tuple, UsdMesh] = {}
     for found in finder.found:
         if not selection.includes(found):

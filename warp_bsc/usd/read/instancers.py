@@ -25,19 +25,9 @@ class Instance:
     """
 
     def __init__(self, instancer: "Instancer", index: int, prototype: int, root: Usd.Prim):
-        """Makes an instance.
-
-        Args:
-            instancer: The point instancer.
-            index: Number of the instance.
-            prototype: Number of its prototype.
-            root: The prototype's topmost prim.
-        """
-        self.instancer = instancer
-        self.index = index
-        self._prototype = prototype
+        """Makes an instance, given the number of its prototype."""
+        self.instancer, self.index, self._prototype, self.root = instancer, index, prototype, root
         self.name = f"{instancer.name}[{index}]"
-        self.root = root
 
     def name_of(self, path: Sdf.Path) -> str:
         """Returns the name that a prim of the prototype has in this instance, given its path."""
@@ -159,13 +149,9 @@ class Instancer:
         return self._last_prototypes[1]
 
     def zero_scales(self, times: list[float]) -> dict[int, float]:
-        """Returns the first time at which an instance has a scale of 0, by instances that do between times of a scene.
-
-        Args:
-            times: The scene's times, ascending.
-        """
+        """Returns the first of some times, ascending, or between them, at which an instance has a scale of 0."""
         scales = self._instancer.GetScalesAttr()
-        found: dict[int, float] = {}
+        found: dict[int, float] = {}  # by instance
         for time in (times[0], *(time for time in scales.GetTimeSamples() if times[0] < time <= times[-1])):
             are_zero = ~np.array(scales.Get(time) or np.ones((1, 3))).any(axis=1)
             found = {index: time for index in np.flatnonzero(are_zero).tolist()} | found

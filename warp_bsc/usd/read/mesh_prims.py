@@ -56,14 +56,8 @@ class MeshPrimFinder:
     """
 
     def __init__(self, file: str | os.PathLike, left_out: LeftOut):
-        """Makes a finder that has found nothing.
-
-        Args:
-            file: The stage's file, for messages.
-            left_out: Records broken skeletons and instancers.
-        """
-        self._file = file
-        self._left_out = left_out
+        """Makes a finder for a stage of a file that has found nothing; broken skeletons and instancers are left out."""
+        self._file, self._left_out = file, left_out
         self._bindings: dict[Sdf.Path, Any] = {}  # by path; of a root, the error or None
         self._clips: dict[Sdf.Path, bool] = {}  # whether the value clips of a prim are left out
         self._with_clips: list[Sdf.Path] = []  # prims with others

@@ -32,12 +32,7 @@ class MeshTransforms:
     """
 
     def __init__(self, frame: Usd.Prim, instance: Instance | None):
-        """Finds the times at which they change.
-
-        Args:
-            frame: The prim whose space points are in.
-            instance: One of the instances, None if no instancer places the prim.
-        """
+        """Finds the times at which they change, given the prim whose space points are in, and one of the instances."""
         self._frame = frame
         self._masking = () if instance else masking_attributes(frame)
         self._root = instance.root if instance else None

@@ -17,7 +17,6 @@ from .samples import as_time_code, sample_times
 from .shapes import MeshPolygons, Polygons, ShapePolygons, TetPolygons, is_shape
 from .skinning import Skin
 from .strands import Strands, is_strands
-from .tetrahedra import NOT_REPAIRED
 from .topology import BROKEN, Topologies, is_empty
 from .unreadable import UnreadableError, reading
 
@@ -224,13 +223,15 @@ class UsdMesh:
             return "it is in an instance, which shares its points with others"
         if self.is_shape or self.is_strands:
             return f"a {self.type_name} has no faces of its own"
+        if self.has_tetrahedra and self.is_skinned:
+            return "a skeleton or blend shapes deform its tetrahedra"
         return None
 
     @property
     def why_not_repaired(self) -> str | None:
         """Why a repair does not move the mesh, in words; None if it may."""
         if self.why_not_written or self.deforms:
-            return self.why_not_written or (NOT_REPAIRED if self.has_tetrahedra else None)
+            return self.why_not_written
         return "its points do not move, only its transform" if self.times else "it does not move"
 
     def read_points(self, time: float, *, before: bool = False) -> np.ndarray:

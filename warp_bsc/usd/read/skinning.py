@@ -23,17 +23,8 @@ class Skin:
         skeleton_query: UsdSkel.SkeletonQuery,
         where: str,
     ):
-        """Finds the animation of a binding.
-
-        Args:
-            skinning: Query of the mesh, as of :func:`find_bindings`.
-            skeleton: The skeleton.
-            skeleton_query: Its query.
-            where: File and prim, for messages.
-        """
-        self._where = where
-        self._skinning = skinning
-        self._query = skeleton_query
+        """Finds the animation of a binding, as of :func:`find_bindings`; messages say ``where``, file and prim."""
+        self._where, self._skinning, self._query = where, skinning, skeleton_query
         self._animation = skeleton_query.GetAnimQuery()
         prim = skinning.GetPrim()
         self._blend_shapes: UsdSkel.BlendShapeQuery | None = None

@@ -5,9 +5,6 @@ from typing import Any
 
 import numpy as np
 
-NOT_REPAIRED = "its tetrahedra could invert"
-"""Why a repair does not move a mesh of tetrahedra that deforms, in words."""
-
 
 class Tetrahedra:
     """The tetrahedra of some meshes, merged to one list, and the positions of their vertices.
@@ -17,14 +14,11 @@ class Tetrahedra:
         first: Number of the first tetrahedron of each of these, then of all tetrahedra, shape [len(names) + 1].
         corners: Vertices of each tetrahedron, whose volume is positive unless it is inverted, shape [tet_count, 4].
         vertex_count: Number of vertices.
+        points: The numbers of the vertices, and the points of the prim that they are, by the names of the meshes.
     """
 
     def __init__(self, usd_meshes: list[Any], time: float):
-        """Reads the tetrahedra.
-
-        Args:
-            usd_meshes: The meshes, see :class:`~warp_bsc.usd.read.meshes.UsdMesh`.
-            time: Time code.
+        """Reads the tetrahedra of meshes, see :class:`~warp_bsc.usd.read.meshes.UsdMesh`, at a time code.
 
         Raises:
             UnreadableError: If a mesh is broken.
@@ -32,6 +26,7 @@ class Tetrahedra:
         self._parts = []
         corners, counts = [np.zeros((0, 4), dtype=np.int64)], []
         self.vertex_count = 0
+        self.points: dict[str, tuple[slice, np.ndarray]] = {}
         for mesh in usd_meshes:
             if mesh.has_tetrahedra:
                 point_count = len(mesh.read_points(time))
@@ -39,6 +34,7 @@ class Tetrahedra:
                 self._parts.append((mesh, point_count, used))
                 corners.append(own.reshape(-1, 4) + self.vertex_count)
                 counts.append(len(corners[-1]))
+                self.points[mesh.name] = slice(self.vertex_count, self.vertex_count + len(used)), used
                 self.vertex_count += len(used)
         self.corners = np.concatenate(corners)
         self.first = np.array([*accumulate(counts, initial=0)])

@@ -8,7 +8,8 @@ A triage file is JSON in UTF-8, with an entry a line::
     ]}
 
 ``meshes`` are two patterns as of :class:`warp_bsc.Selection`, twice the same for a mesh with itself, or one for a mesh
-with all others. Patterns begin with ``/`` or ``*``.
+with all others. Patterns begin with ``/`` or ``*``; of mesh files they are the names that a command is given, such as
+``coat_####.ply``.
 """
 
 import datetime
@@ -18,7 +19,7 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..._arguments import given
+from ..._arguments import checked_flag, given
 from ..._atomic_file import naming
 from ..selection import Meant, Selection
 
@@ -56,19 +57,21 @@ def select_by_triage(stage: "Usd.Stage") -> tuple[str, Selection | None]:
     return path, Selection(triage=read_triage(path))
 
 
-def read_triage(path: str | os.PathLike) -> tuple[Meant, ...]:
+def read_triage(path: str | os.PathLike, *, of_files: bool = False) -> tuple[Meant, ...]:
     """Returns the entries of a triage file, for the attribute ``triage`` of :class:`warp_bsc.Selection`.
 
     Args:
         path: The file, as the page on replays describes it.
+        of_files: Whether its meshes are names of mesh files, of any form, in place of paths of prims.
 
     Raises:
         OSError: If it cannot be read.
-        TypeError: If the path has another type.
+        TypeError: If an argument has another type.
         ValueError: If it is not a triage file; the message names the entry.
     """
     if not isinstance(path, str | os.PathLike):
         raise TypeError(f"path must be the path of a triage file, not {given(path)}")
+    is_name = checked_flag(of_files, "of_files")
     with naming(path):
         content = Path(path).read_bytes()
     try:
@@ -76,18 +79,18 @@ def read_triage(path: str | os.PathLike) -> tuple[Meant, ...]:
         _check_keys(found, "the file", {"version": int, "meant": list})
         if found["version"] != 1:
             raise ValueError(f"version is {found['version']}, and this version of warp-bsc reads version 1")
-        return tuple(_read_entry(entry, f"meant[{number}]") for number, entry in enumerate(found["meant"]))
+        return tuple(_read_entry(entry, f"meant[{number}]", is_name) for number, entry in enumerate(found["meant"]))
     except ValueError as error:  # of its encoding, too
         raise ValueError(f"{path}: not a triage file: {error}") from None
 
 
-def _read_entry(entry: Any, name: str) -> Meant:
+def _read_entry(entry: Any, name: str, of_files: bool) -> Meant:
     _check_keys(entry, name, {"meshes": list, "reason": str, "who": str, "date": str})
     meshes = entry["meshes"]
     if len(meshes) not in (1, 2):
         raise ValueError(f"{name}: meshes must be one or two, not {len(meshes)}")
     for mesh in meshes:
-        if not isinstance(mesh, str) or not _PATTERN.fullmatch(mesh):
+        if not isinstance(mesh, str) or not (of_files or _PATTERN.fullmatch(mesh)):
             raise ValueError(f"{name}: meshes: {mesh!r} is not the path of a prim, and no pattern of one")
     try:
         datetime.date.fromisoformat(entry["date"])

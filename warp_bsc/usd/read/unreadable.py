@@ -46,13 +46,7 @@ class LeftOut:
     """
 
     def __init__(self, file: str | os.PathLike, is_strict: bool, allow_missing: tuple[str, ...] = ()):
-        """Makes an empty record; its sentences do not repeat the file's name.
-
-        Args:
-            file: The file.
-            is_strict: Whether leaving out a part is an error.
-            allow_missing: As of :class:`~warp_bsc.usd.scene.Scene`.
-        """
+        """Makes an empty record, whose sentences do not repeat the file's name; arguments are those of a scene."""
         self._prefix = f"{file}: "
         self._allow_missing = allow_missing
         self.is_strict = is_strict

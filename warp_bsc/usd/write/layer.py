@@ -3,15 +3,13 @@
 import contextlib
 import os
 import secrets
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ..._atomic_file import OutputFile
 from ..scene import Scene
-from .layer_writer import new_layer
+from .layer_writer import AddSample, new_layer
 
 
 def unused_path(scene: Scene, path: str) -> str:
@@ -39,7 +37,7 @@ class SceneLayer:
     @contextlib.contextmanager
     def writing(
         self, file: OutputFile, documentation: str, custom: dict[str, dict[str, Any]], end: float | None = None
-    ) -> Iterator[tuple[Any, Callable[[str, str, float, np.ndarray], None]]]:
+    ) -> Iterator[tuple[Any, AddSample]]:
         """Makes the layer, which the block fills, with results and errors of :func:`new_layer`; then commits the file.
 
         Args:
@@ -81,9 +79,6 @@ def _metadata_of(scene: Scene) -> dict[str, str | float]:
     """Returns the scene's metadata by name, for a layer over it, as a stage reads metadata only from its root layer.
 
     A missing default prim is replaced by the scene's first prim, a missing range of time codes by that of its times.
-
-    Raises:
-        ValueError: If the scene has no file.
     """
     if not scene.has_file:
         raise ValueError(f"{scene.path}: a USD stage in memory has no file for a layer to be over: export it")
@@ -91,11 +86,9 @@ def _metadata_of(scene: Scene) -> dict[str, str | float]:
     start, end = scene.times[0], scene.times[-1]
     if stage.HasAuthoredTimeCodeRange():
         start, end = (float(stage.GetMetadata(name)) for name in ("startTimeCode", "endTimeCode"))
-    has_default = bool(stage.GetDefaultPrim())
+    default = stage.GetRootLayer().defaultPrim if stage.GetDefaultPrim() else ""
     return {
-        "defaultPrim": (
-            stage.GetRootLayer().defaultPrim if has_default else stage.GetPseudoRoot().GetChildren()[0].GetName()
-        ),
+        "defaultPrim": default or stage.GetPseudoRoot().GetChildren()[0].GetName(),
         "endTimeCode": end,
         "framesPerSecond": stage.GetFramesPerSecond(),
         "metersPerUnit": scene.meters_per_unit,

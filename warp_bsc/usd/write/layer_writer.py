@@ -17,6 +17,9 @@ SHAPES = {f"{name}[]": ("f4", 3) for name in ("float3", "point3f", "vector3f", "
 SHAPES |= {"float[]": ("f4", 1), "int[]": ("i4", 1), "int2[]": ("i4", 2)}
 """Type and number of the components of a row, by the type of an attribute."""
 
+AddSample = Callable[[str, str, float | None, np.ndarray], None]
+"""Adds a sample to a layer, see :func:`new_layer`."""
+
 _SAVED = 1 << 25  # bytes of samples that a layer holds in memory before it saves them
 
 
@@ -57,7 +60,7 @@ class LayerPrim:
 
 
 @contextlib.contextmanager
-def new_layer(path: Path, file_format: str) -> Iterator[tuple[Any, Callable[[str, str, float, np.ndarray], None]]]:
+def new_layer(path: Path, file_format: str) -> Iterator[tuple[Any, AddSample]]:
     """Makes a layer in USD's binary format, in which saved samples leave the memory, and saves it after the block.
 
     Args:
@@ -66,7 +69,7 @@ def new_layer(path: Path, file_format: str) -> Iterator[tuple[Any, Callable[[str
 
     Yields:
         The layer, and a function that adds a sample to it, given the path of its attribute and its type of
-        :data:`SHAPES`, its time code, and its value.
+        :data:`SHAPES`, its time code, None for its default, and its value.
 
     Raises:
         OSError: If the file cannot be written.
@@ -76,11 +79,14 @@ def new_layer(path: Path, file_format: str) -> Iterator[tuple[Any, Callable[[str
     arrays = {("f4", 3): Vt.Vec3fArray, ("f4", 1): Vt.FloatArray, ("i4", 1): Vt.IntArray, ("i4", 2): Vt.Vec2iArray}
     waiting = 0
 
-    def add(attribute: str, value_type: str, time: float, value: np.ndarray) -> None:
+    def add(attribute: str, value_type: str, time: float | None, value: np.ndarray) -> None:
         nonlocal waiting
         shape = SHAPES[value_type]
         array = np.ascontiguousarray(value, shape[0])
-        layer.SetTimeSample(attribute, time, arrays[shape].FromNumpy(array))
+        if time is None:
+            layer.GetAttributeAtPath(attribute).default = arrays[shape].FromNumpy(array)
+        else:
+            layer.SetTimeSample(attribute, time, arrays[shape].FromNumpy(array))
         waiting += array.nbytes
         if waiting > _SAVED:
             layer.Save()

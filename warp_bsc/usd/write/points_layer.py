@@ -25,7 +25,7 @@ class MovedFrame:
         time: Time code.
         before: Whether the moment just before that time is meant, at which a mesh then jumps or a segment ends.
         segment: The meshes.
-        vertices: The moved vertices, shape [n].
+        vertices: The moved vertices, shape [n]; after those of the segment, the ones of its tetrahedra inside surfaces.
         x: Their positions in world space, float64, shape [n, 3].
     """
 
@@ -37,22 +37,26 @@ class MovedFrame:
 
     def by_mesh(self) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
         """Yields the number of each mesh with moved vertices, these among its prim's points, and their positions."""
-        rows = np.full(self.segment.vertex_count, -1)
+        count, tetrahedra = self.segment.vertex_count, self.segment.tetrahedra
+        rows = np.full(count + tetrahedra.vertex_count, -1)
         rows[self.vertices] = np.arange(len(self.vertices))
         for number, mesh in enumerate(self.segment.meshes):
-            own = rows[self.segment.vertices_of(number)]
+            own, points = rows[self.segment.vertices_of(number)], mesh.points
+            if mesh.name in tetrahedra.points:
+                numbers, inner = tetrahedra.points[mesh.name]
+                own, points = np.append(own, rows[count:][numbers]), np.append(points, inner)
             if (own >= 0).any():
-                yield number, mesh.points[own >= 0], self.x[own[own >= 0]]
+                yield number, points[own >= 0], self.x[own[own >= 0]]
 
 
 class PointsLayer:
     """A layer whose sublayer is the scene, so that opening it shows the scene with the moved points.
 
-    A moved mesh has a sample of its points at each time of the scene and of its own. Points that are not moved have the
-    bits of the scene. Meshes that are not moved at any time have no opinion in the layer. A skeleton or blend shapes no
-    longer deform a moved mesh: its points are those that they would give it. Authored normals turn with the surface,
-    authored extents are computed again where points move, authored velocities get the velocity of the displacement, and
-    authored accelerations are blocked.
+    A moved mesh has a sample of its points at each time of the scene and of its own; one that has no samples has none
+    here either, but other points. Points that are not moved have the bits of the scene. Meshes that are not moved at
+    any time have no opinion in the layer. A skeleton or blend shapes no longer deform a moved mesh: its points are
+    those that they would give it. Authored normals turn with the surface, authored extents are computed again where
+    points move, authored velocities get the velocity of the displacement, and authored accelerations are blocked.
 
     Attributes:
         file: The file.
@@ -84,7 +88,7 @@ class PointsLayer:
         """
         for number, points, positions in frame.by_mesh():
             name = frame.segment.meshes[number].name
-            x = _to_own_space(self._scene.prim_of(name), positions, frame.time, frame.before)
+            x = to_own_space(self._scene.prim_of(name), positions, frame.time, frame.before)
             self._moved.setdefault(name, {})[frame.time, frame.before] = self._moves.tell(), len(points)
             rest = memoryview(points.astype(np.int64).tobytes() + x.tobytes())
             while rest:
@@ -136,7 +140,7 @@ class PointsLayer:
             blocked.default = Sdf.ValueBlock()
         frames = [(*key, *self._points(mesh, *key)) for key in self._times(mesh)]
         for index, (time, before, old, new) in enumerate(frames):
-            code = just_before(time) if before else time
+            code = None if not mesh.times else just_before(time) if before else time
             following = frames[index + 1] if index + 1 < len(frames) else None
             if following is not None and following[0] > time and len(following[2]) == len(old):
                 seconds = (following[0] - time) / self._scene.time_codes_per_second
@@ -165,11 +169,9 @@ class PointsLayer:
     def _points(self, mesh, time, before) -> tuple[np.ndarray, np.ndarray]:
         """Returns the points of a mesh in the scene and in the layer, shapes [point_count, 3]."""
         old = _own_points(mesh, time, before)
-        moved = self._moved[mesh.name].get((time, before))
-        if moved is None:
+        if (time, before) not in self._moved[mesh.name]:
             return old, old
-        new = old.copy()
-        place, count = moved
+        new, (place, count) = old.copy(), self._moved[mesh.name][time, before]
         self._moves.seek(place)
         points = np.frombuffer(self._moves.read(8 * count), np.int64)
         new[points] = np.frombuffer(self._moves.read(12 * count), np.float32).reshape(-1, 3)
@@ -183,7 +185,7 @@ class _Surface:
     def __init__(self, mesh: "UsdMesh"):
         from pxr import UsdGeom  # noqa: PLC0415 (slow)
 
-        self._schema = UsdGeom.Mesh(mesh.prim)
+        self._mesh, self._schema = mesh, UsdGeom.Mesh(mesh.prim)
         primvar = UsdGeom.PrimvarsAPI(mesh.prim).GetPrimvar("normals")
         has_primvar = primvar and primvar.HasAuthoredValue() and not primvar.IsIndexed()
         self._normals = primvar.GetAttr() if has_primvar else self._schema.GetNormalsAttr()
@@ -194,11 +196,8 @@ class _Surface:
     def samples(self, old, new, added, time) -> Iterator[tuple[str, str, np.ndarray]]:
         """Yields names, types and values of the attributes at a time.
 
-        Args:
-            old: Points in the scene, shape [point_count, 3].
-            new: Points in the layer.
-            added: Velocities of the displacement in a unit a second.
-            time: Time code.
+        ``old`` and ``new`` are the points in the scene and in the layer, shape [point_count, 3]; ``added`` are the
+        velocities of the displacement, in a unit a second.
         """
         yield "points", "point3f[]", new
         if self._extent.HasAuthoredValue():
@@ -216,16 +215,16 @@ class _Surface:
 
     def _turn(self, normals, old, new, time) -> np.ndarray:
         """Returns authored normals turned with the surface; those of a constant or of another number stay."""
-        counts = np.array(self._schema.GetFaceVertexCountsAttr().Get(time))
-        corners = np.array(self._schema.GetFaceVertexIndicesAttr().Get(time))
+        if self._mesh.has_tetrahedra:
+            corners = self._mesh.read_triangles(time, old)[0].ravel()
+            counts = np.full(len(corners) // 3, 3)
+        else:
+            counts = np.array(self._schema.GetFaceVertexCountsAttr().Get(time))
+            corners = np.array(self._schema.GetFaceVertexIndicesAttr().Get(time))
         (a_faces, a_points), (b_faces, b_points) = (_normals_of(x, counts, corners) for x in (old, new))
-        by_interpolation = {
-            "vertex": (a_points, b_points),
-            "varying": (a_points, b_points),
-            "uniform": (a_faces, b_faces),
-            "faceVarying": (a_points[corners], b_points[corners]),
-        }
-        a, b = by_interpolation.get(str(self._interpolation), (normals, normals))
+        both = {"uniform": (a_faces, b_faces), "faceVarying": (a_points[corners], b_points[corners])}
+        both |= dict.fromkeys(("vertex", "varying"), (a_points, b_points))
+        a, b = both.get(str(self._interpolation), (normals, normals))
         if len(a) != len(normals):
             return normals
         changed = (a != b).any(axis=1)
@@ -245,10 +244,10 @@ def _own_points(mesh: "UsdMesh", time: float, before: bool) -> np.ndarray:
         return points
     transform = mesh.read_transform(time, before=before)
     assert transform is not None  # no instancer places it
-    return _to_own_space(mesh, points @ transform[:3, :3] + transform[3, :3], time, before)
+    return to_own_space(mesh, points @ transform[:3, :3] + transform[3, :3], time, before)
 
 
-def _to_own_space(mesh: "UsdMesh", positions: np.ndarray, time: float, before: bool) -> np.ndarray:
+def to_own_space(mesh: "UsdMesh", positions: np.ndarray, time: float, before: bool) -> np.ndarray:
     """Returns positions in world space at, or just before, a time in the space of a mesh's prim, float32."""
     from pxr import UsdGeom  # noqa: PLC0415 (slow)
 
