@@ -96,7 +96,7 @@ class FrameFiles:
     """
 
     def __init__(self, scene: FileScene, outputs: list[list[str | None]]):
-        """Checks that files of the first frame can be written to their ``outputs``, None for those that are not written.
+        """Checks that files of the first frame can be written to ``outputs``, which has None for those that are not.
 
         Raises:
             OSError: If one cannot be.
