@@ -109,7 +109,8 @@ def _report(
         interrupt = None
         try:
             with contextlib.closing(measured):  # takes its bar away
-                runs.extend(measured)
+                for run in measured:
+                    runs.append(run)
         except KeyboardInterrupt as signal:
             interrupt = signal
         with INTERRUPTS.held():

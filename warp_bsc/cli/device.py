@@ -42,9 +42,7 @@ def find_devices(names: str | None) -> list[wp.Device]:
 def loading_kernels(device: wp.DeviceLike, console: rich.console.Console | None = None) -> Iterator[None]:
     """Prints a message if kernels are compiled in the block for more than two seconds, and then how many have been.
 
-    Args:
-        device: The device.
-        console: Where to print it, such as above a bar that shows progress; standard error for None.
+    A console may be that of a bar that shows progress; None is standard error.
     """
     console = Console(stderr=True) if console is None else console
     times = []  # of the compilations
@@ -75,15 +73,9 @@ def load_detector(
     proximities: bool = False,
     strands: bool = False,
 ) -> None:
-    """Loads the detector's kernels for a type of positions, which may compile them.
+    """Loads the detector's kernels for a type of positions, float32 or float64, which may compile them.
 
-    Args:
-        method: Method of detection.
-        dtype: Type of the positions, float32 or float64.
-        device: The Warp device.
-        intersections: Whether to load the kernels that find intersections.
-        proximities: Whether to load the kernels that find proximities.
-        strands: Whether to load the kernels for curves and points.
+    Those that find intersections and proximities are loaded where asked for, and so are those for curves and points.
     """
     triangles = CollisionMesh(np.arange(6).reshape(2, 3), 6, device=device)
     points = np.zeros((6, 3), dtype)

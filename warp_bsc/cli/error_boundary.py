@@ -19,12 +19,8 @@ from .option_names import with_option
 def run_guarded(command: Callable[[], int]) -> int:
     """Runs a command and returns its exit status, also after an error or a signal.
 
-    Args:
-        command: Returns the exit status.
-
-    Returns:
-        2 after an error, 5 if a scene has nothing to check, 128 plus its number after a signal, each with a line on
-        standard error; 141 without a line if the reader of standard output or standard error has closed it.
+    This is 2 after an error, 5 if a scene has nothing to check, 128 plus its number after a signal, each with a line on
+    standard error; 141 without a line if the reader of standard output or standard error has closed it.
     """
     with INTERRUPTS.handled(), _encodable_output():
         try:
@@ -65,11 +61,8 @@ def finish_outputs(outputs: dict[str, Any], finish: Callable[[Any, str], None]) 
     """Finishes files, without their last parts if the disk is full; returns messages on missing parts.
 
     On a full disk all files shrink down to half of their intervals. After that only the file that does not fit
-    shrinks, or is omitted; the page comes first, as it matters least.
-
-    Args:
-        outputs: The files by their names, the page last; each can ``shrink``.
-        finish: Finishes a file, given also why it has shrunk; empty if it has not.
+    shrinks, or is omitted; the page comes first, as it matters least: it is the last of ``outputs`` by their names,
+    which can ``shrink``. ``finish`` finishes a file, given also why it has shrunk; empty if it has not.
     """
     problems, shortages = [], {}
     shared = 5  # number of eighths that all files lose, which leave about a half

@@ -32,13 +32,8 @@ def add_command(
 ) -> argparse.ArgumentParser:
     """Adds a command and returns its parser.
 
-    Args:
-        commands: The commands to add it to.
-        name: The command's name.
-        run: Runs it with the parsed arguments and returns the exit status, None for 0; None for a group of commands.
-        summary: One line for the list of commands.
-        description: The help text above the options.
-        epilog: The help text below the options.
+    ``run`` runs it with the parsed arguments and returns the exit status, None for 0; it is None for a group of
+    commands. ``summary`` is its line in the list of commands; the help texts are above and below the options.
     """
     command = commands.add_parser(
         name, help=summary, description=description, epilog=epilog, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -62,20 +57,12 @@ def add_options(group: argparse._ActionsContainer, options: Options) -> None:
 
 
 def distance(text: str) -> float:
-    """Returns the distance that a text holds.
-
-    Raises:
-        argparse.ArgumentTypeError: If it is not a number, not finite or less than 2^-1021, for example 0.
-    """
+    """Returns the distance that a text holds; an ArgumentTypeError if it is not finite, or less than 2^-1021."""
     return _real(text, SMALLEST_DISTANCE, "more than 0, at least 2^-1021")
 
 
 def positive_real(text: str) -> float:
-    """Returns the number that a text holds.
-
-    Raises:
-        argparse.ArgumentTypeError: If it is not a number, not finite or not more than 0.
-    """
+    """Returns the number that a text holds; an ArgumentTypeError if it is not finite, or not more than 0."""
     return _real(text, math.ulp(0.0), "more than 0")
 
 
@@ -90,20 +77,12 @@ def _real(text: str, least: float, what: str) -> float:
 
 
 def positive(text: str) -> int:
-    """Returns the integer that a text holds.
-
-    Raises:
-        argparse.ArgumentTypeError: If it is not an integer in [1, 2^31).
-    """
+    """Returns the integer that a text holds; an ArgumentTypeError if it is not in [1, 2^31)."""
     return _integer(text, 1)
 
 
 def natural(text: str) -> int:
-    """Returns the integer that a text holds, which may be 0.
-
-    Raises:
-        argparse.ArgumentTypeError: If it is not an integer in [0, 2^31).
-    """
+    """Returns the integer that a text holds; an ArgumentTypeError if it is not in [0, 2^31)."""
     return _integer(text, 0)
 
 
@@ -155,19 +134,11 @@ def pair(help: str) -> dict:
 def names_of(known: Iterable[str], help: str, *, metavar: str = "NAME,...", all_by_default: bool = True) -> dict:
     """Returns an option whose value is a tuple of names, each once, in the order that they are given in.
 
-    Args:
-        known: The names that there are.
-        help: The help text.
-        metavar: What stands for the value in help texts.
-        all_by_default: Whether the default is all that there are, not None.
+    ``metavar`` stands for the value in help texts; the default is all names that there are, or None.
     """
     known = tuple(known)
-    return {
-        "type": functools.partial(_names, known),
-        "help": help,
-        "default": known if all_by_default else None,
-        "metavar": metavar,
-    }
+    default = known if all_by_default else None
+    return {"type": functools.partial(_names, known), "help": help, "default": default, "metavar": metavar}
 
 
 def _names(known: tuple[str, ...], text: str) -> tuple[str, ...]:
@@ -203,12 +174,7 @@ def repeat_options(default: int) -> Options:
 
 
 def add_fail_on(group: argparse._ActionsContainer, reasons: dict[str, str]) -> None:
-    """Adds --fail-on, whose value is a set of reasons.
-
-    Args:
-        group: The command, or a group of its options.
-        reasons: The kinds of finding, and an explanation of each, which may be empty.
-    """
+    """Adds --fail-on, whose value is a set of reasons: kinds of finding, each with an explanation that may be empty."""
     explained = ", ".join(f"{reason} ({text})" if text else reason for reason, text in reasons.items())
     several = " of these, separated by commas" if len(reasons) > 1 else ""
     group.add_argument(

@@ -130,12 +130,7 @@ def read_scene(
 ) -> Scene:
     """Opens a scene with the options of :func:`add_scene_selection` that say how it is read, and shows the progress.
 
-    Args:
-        path: The file.
-        arguments: The options.
-        written: The files that are to be written.
-        as_json: Whether the progress is for programs.
-        options: Other arguments of the scene.
+    The files of ``written`` are to be written; with ``as_json`` the progress is for programs.
 
     Raises:
         ImportError: If OpenUSD is missing or too old.

@@ -28,15 +28,10 @@ def print_table(
     total: Any = None,
     caption: str | None = None,
 ) -> None:
-    """Prints a table.
+    """Prints a table, with a caption below it.
 
-    Args:
-        console: The terminal or file to print to.
-        first: The column of the names of the rows, or its header.
-        columns: The other columns.
-        rows: The name of each row, and what the columns show of it; None leaves them empty.
-        total: What the columns show of all rows together, in a last one; None without.
-        caption: A sentence below the table.
+    ``first`` is the column of the names of the rows, or its header. A row is its name, and what the other columns show
+    of it, None for nothing; ``total`` is what they show of all rows together, in a last one.
     """
     table = Table(box=box.SIMPLE_HEAD, padding=0, show_edge=False, caption=caption, caption_justify="left")
     columns = list(columns)

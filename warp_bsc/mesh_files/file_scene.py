@@ -39,12 +39,7 @@ class FileScene(Scene):
         *,
         selection: Selection = Selection(),  # noqa: B008 (frozen)
     ):
-        """Reads the files.
-
-        Args:
-            frames: The files.
-            selection: What is meant to meet, by the names of the files.
-            progress: Called with the number of frames that have been read, and their total.
+        """Reads the files; ``progress`` is called with the number of frames that have been read, and their total.
 
         Raises:
             OSError: If a file cannot be read.
@@ -101,11 +96,7 @@ class FrameFiles:
     """
 
     def __init__(self, scene: FileScene, outputs: list[list[str | None]]):
-        """Checks that the files of the first frame can be written.
-
-        Args:
-            scene: The scene.
-            outputs: Where each file of each frame is written to, None for those that are not.
+        """Checks that files of the first frame can be written to ``outputs``, which has None for those that are not.
 
         Raises:
             OSError: If one cannot be.

@@ -105,21 +105,17 @@ def find_frames(names: Sequence[str]) -> Frames:
         FileNotFoundError: If no file matches a pattern.
         ValueError: If a file has no number, or one that another one has, or a pattern lacks a frame of another one.
     """
-    found = [_numbered(name) if _is_pattern(name) else {} for name in names]
-    numbers = sorted({number for files in found for number in files}) or [0]
-    for name, files in zip(names, found, strict=True):
+    are_patterns = [not os.path.exists(name) and any(character in name for character in PATTERNS) for name in names]
+    found = [(name, _numbered(name) if is_one else {}) for name, is_one in zip(names, are_patterns, strict=True)]
+    numbers = sorted({number for _, files in found for number in files}) or [0]
+    for name, files in found:
         if missing := [number for number in numbers if files and number not in files]:
             raise ValueError(f"{name}: there is no file for frame {missing[0]}")
-    pairs = list(zip(names, found, strict=True))
-    return Frames(list(names), numbers, [[files.get(number, name) for name, files in pairs] for number in numbers])
+    return Frames(list(names), numbers, [[files.get(number, name) for name, files in found] for number in numbers])
 
 
 def _is_folder(output: str) -> bool:
     return output.endswith(("/", os.sep))
-
-
-def _is_pattern(name: str) -> bool:
-    return not os.path.exists(name) and any(character in name for character in PATTERNS)
 
 
 def _numbered(pattern: str) -> dict[int, str]:
