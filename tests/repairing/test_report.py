@@ -4,8 +4,10 @@ import matplotlib.image
 import numpy as np
 import pytest
 from chromium import Browser
-from dipping import FRAMES, HIT, dipping_sheet, points_of, repaired
+from dipping import FRAMES, HIT, dipping_sheet, points_of, repaired, sheet
+from pxr import UsdGeom
 from replay_files import Page
+from usd_stages import add_mesh
 
 from warp_bsc.repairing.shot import report
 
@@ -55,6 +57,26 @@ def test_page_is_bounded(tmp_path, monkeypatch):
     assert 20 <= len(page.block("faces-0")["faces"]) // 3 <= 100
     notes = " ".join(page.data["notes"])
     assert f"of {len(moves)} moved frames have a view" in notes and "of 256 triangles around what is moved" in notes
+
+
+def test_views_of_frames_have_the_faces_of_their_meshes(tmp_path, monkeypatch):
+    """Also where another mesh appears, and only frames after that have a view."""
+    monkeypatch.setattr(report, "_MOST_VIEWS", 1)
+    monkeypatch.setattr(report, "spread", lambda count, most: np.array([count - 1]))
+    stage = dipping_sheet(tmp_path)
+    points = UsdGeom.Mesh(stage.GetPrimAtPath("/World/Sheet")).GetPointsAttr()
+    points.Set([tuple(map(float, p)) for p in sheet(0.1, -0.14)], HIT + 12)
+    add_mesh(stage, "/World/Late", [(5.0, 5.0, 5.0), (6.0, 5.0, 5.0), (5.0, 6.0, 5.0)], [3], [0, 1, 2])
+    visibility = UsdGeom.Imageable(stage.GetPrimAtPath("/World/Late")).CreateVisibilityAttr()
+    visibility.Set("invisible", 0)
+    visibility.Set("inherited", HIT + 6)
+    repaired(stage, "--report", str(tmp_path / "page.html"))
+    page = Page((tmp_path / "page.html").read_text())
+    last = max(frame["view"] for frame in page.data["frames"] if frame["view"] is not None)
+    block = page.block(f"frame-{last}")
+    assert page.data["frames"][last]["time"] > HIT + 6
+    names = [page.data["meshes"][mesh]["name"] for mesh in page.block(f"faces-{block['faces']}")["mesh_of_vertex"]]
+    assert {"/World/Plate", "/World/Sheet", "/World/Late"} == set(names)
 
 
 def test_page_is_named_twice(tmp_path, capsys):

@@ -71,13 +71,14 @@ def write_page(
 
 
 class _Summary:
-    """The numbers of a repair and its moved frames; by segment, whether each vertex is moved at some time."""
+    """The numbers of a repair and its moved frames, with their segments, and which vertices of these are moved."""
 
     def __init__(self, scene: Scene, stretches: Iterable[RepairedStretch]):
         self._scene = scene
         self._stretches: list[RepairedStretch] = []
         self.frames: list[dict[str, Any]] = []
         self.segments: list[Segment] = []
+        self.segment_of: list[int] = []
         self.moved: list[np.ndarray] = []
         for stretch in stretches:
             distorted = stretch.distorted()
@@ -88,6 +89,7 @@ class _Summary:
                 if not self.segments or frame.segment is not self.segments[-1]:
                     self.segments.append(frame.segment)
                     self.moved.append(np.zeros(frame.segment.vertex_count, dtype=bool))
+                self.segment_of.append(len(self.segments) - 1)
                 self.moved[-1][frame.vertices[frame.vertices < frame.segment.vertex_count]] = True
             self._stretches.append(stretch)
 
@@ -180,17 +182,17 @@ class _Views:
         self._faces = [
             _faces_to_show(segment, moved, most) for segment, moved in zip(summary.segments, summary.moved, strict=True)
         ]
-        self._segment, self._number = None, -1
+        self._number = -1
         self._meshes = {name: number for number, name in enumerate(scene.names)}
         self._center: np.ndarray | None = None
 
     def of(self, moved: MovedFrame, number: int) -> list[str]:
         """Returns the blocks of a frame, with its number among all."""
-        segment, is_new = moved.segment, moved.segment is not self._segment
-        self._segment, self._number = segment, self._number + is_new
+        segment, before = moved.segment, self._number
+        self._number = self._summary.segment_of[number]
         vertices, corners = np.unique(segment.faces[self._faces[self._number]], return_inverse=True)
         texts = []
-        if is_new:
+        if self._number != before:
             names = [segment.meshes[mesh].name for mesh in segment.locate_vertices(vertices)[0]]
             meshes = np.array([self._meshes[name] for name in names], dtype=np.int64)
             texts.append(block(f"faces-{self._number}", {}, {"faces": corners, "mesh_of_vertex": meshes}))
