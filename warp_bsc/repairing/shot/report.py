@@ -74,13 +74,12 @@ class _Summary:
     """The numbers of a repair and its moved frames, with their segments, and which vertices of these are moved."""
 
     def __init__(self, scene: Scene, stretches: Iterable[RepairedStretch]):
-        self._scene = scene
-        self._stretches: list[RepairedStretch] = []
+        self._scene, self._stretches = scene, list(stretches)
         self.frames: list[dict[str, Any]] = []
         self.segments: list[Segment] = []
         self.segment_of: list[int] = []
         self.moved: list[np.ndarray] = []
-        for stretch in stretches:
+        for stretch in self._stretches:
             distorted = stretch.distorted()
             for frame, move, ends in zip(stretch.frames, stretch.largest_moves, stretch.edge_ratios, strict=True):
                 moved = len(frame.vertices)
@@ -91,7 +90,6 @@ class _Summary:
                     self.moved.append(np.zeros(frame.segment.vertex_count, dtype=bool))
                 self.segment_of.append(len(self.segments) - 1)
                 self.moved[-1][frame.vertices[frame.vertices < frame.segment.vertex_count]] = True
-            self._stretches.append(stretch)
 
     def data(
         self, before: list[Finding], after: list[Finding] | None, kept: dict[str, str], min_distance: float
