@@ -45,7 +45,7 @@ _STRAINED = 0.095
 _RELAXATIONS, _RELAXING = 16, {"sweeps": 40, "slack": 0.5 * _STRAINED, "momentum": 0.8}
 """Detections, and what springs do before each."""
 _FAILURES = 5
-"""Detections with collisions after which the vertices that collide stay where they were."""
+"""Detections with collisions after which the vertices that collide stay where they were; all, if a distance is kept."""
 _RINGS = 10
 """Edges around displaced vertices within which springs move others."""
 _TIMES = 9
@@ -183,7 +183,7 @@ class Follower:
         displaced = np.asarray((frame.x != frame.given).any(axis=1))
         displaced[known.vertices] = True
         moving, failures = (around := springs.around(displaced, _RINGS)), 0
-        for _ in range(_RELAXATIONS):
+        for _ in range(_FAILURES if self._min_distance else _RELAXATIONS):
             x = springs.relax(frame.x.astype(np.float64), contacts=known, around=moving, **_RELAXING)
             x = self._moved_apart(x, frame.given, known, moving).astype(np.float32)
             changed, collide = (x != frame.x).any(axis=1) if is_free else self._is_movable, np.zeros_like(moving)
