@@ -37,7 +37,7 @@ def search(
 
     Args:
         surface: The surface.
-        max_strain: Largest strain that is sought, of all functions here.
+        max_strain: Largest strain that is sought, as in the other functions.
         history: Positions at which nothing crosses, in units, shape [n, 3]; default: none.
         sheet: Sheet of each vertex from inside to outside, -1 for none, int, shape [n]; default: not known.
 

@@ -15,7 +15,6 @@ from .free import search
 from .model_surface import ModelSurface
 from .results import RepairResult, describe
 from .sheets import joined_sheets
-from .tetrahedra import find_inverted
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +96,7 @@ def repair_state(
         x=x[:count],
         inside_before=len(before.inside),
         inside=surface.particles_inside(after.x),
-        inverted_before=len(find_inverted(surface, before.x)),
-        inverted=len(find_inverted(surface, after.x)),
+        inverted_before=len(surface.inverted(before.x)),
+        inverted=len(surface.inverted(after.x)),
         mesh=surface.given,
     )

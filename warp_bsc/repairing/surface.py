@@ -205,6 +205,15 @@ class Surface:
         """The mesh with its radii."""
         return welded(self.mesh, self.weld, self.radius)
 
+    @functools.cached_property
+    def _inversion_detector(self) -> CollisionDetector:
+        mesh = CollisionMesh(np.zeros((0, 3), int), len(self.home), tets=self.tetrahedra, device=self.device)
+        return CollisionDetector(mesh)
+
+    def inverted(self, x: np.ndarray) -> np.ndarray:
+        """Returns the tetrahedra whose volume is not positive, exactly, at rounded positions in units, int."""
+        return self._inversion_detector.find_inversions(self.detected(x))
+
     @property
     def keeps_distance(self) -> bool:
         """Whether elements keep a distance."""

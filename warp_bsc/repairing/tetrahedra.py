@@ -1,20 +1,12 @@
-"""Keeps tetrahedra from inverting: decides their orientation exactly, and moves their inner vertices along."""
+"""Keeps tetrahedra from inverting: moves their inner vertices along, or puts back what would invert."""
 
 import numpy as np
 
 from ..detection.at_rest.body_parts import connect_cells
-from ..detection.detector import CollisionDetector
-from ..detection.mesh import CollisionMesh
 from .elastic import Springs
 from .surface import Surface, differ
 
 _SWEEPS = 200
-
-
-def find_inverted(surface: Surface, x: np.ndarray) -> np.ndarray:
-    """Returns the tetrahedra of a surface whose volume is not positive, exactly, at rounded positions in units, int."""
-    mesh = CollisionMesh(np.zeros((0, 3), int), len(x), tets=surface.tetrahedra, device=surface.device)
-    return CollisionDetector(mesh).find_inversions(surface.detected(x))
 
 
 def follow_surface(surface: Surface, x: np.ndarray) -> np.ndarray:
@@ -33,7 +25,7 @@ def follow_surface(surface: Surface, x: np.ndarray) -> np.ndarray:
         moves = np.where(is_inner[:, None], 0.0, x - surface.home)
         spread = Springs(surface, is_inner).spread(moves, ~is_inner, _SWEEPS)
         x = surface.rounded(np.where(is_inner[:, None], surface.home + spread, x))
-    inverted = np.setdiff1d(find_inverted(surface, x), find_inverted(surface, surface.home))
+    inverted = np.setdiff1d(surface.inverted(x), surface.inverted(surface.home))
     if not len(inverted):
         return x
     moved = differ(x, surface.home)
