@@ -3,16 +3,18 @@
 import numpy as np
 import warp as wp
 
+from ..detection.at_rest.body_parts import connect_cells
 from ..detection.run.launch import launch, launch_in_turn
 from .contacts import Contacts, as_planes
 from .kernels import Planes, grow_ring, relax_springs, spread_moves
-from .surface import Surface
+from .surface import Surface, differ
 
 _BENDING = 0.3
 _SHORTEST = 10.0
 """Median length of an edge, in lengths of a spring, up to which shorter springs are stiffer, so that strains even out.
 """
 _NOT_REACHED = 2**31 - 1
+_INNER_SWEEPS = 200
 
 
 def near(surface: Surface, vertices: np.ndarray, rings: int) -> np.ndarray:
@@ -128,6 +130,31 @@ class Springs:
         """Returns values after some launches of a kernel that writes those of movable vertices."""
         given = self._surface.array(values)
         return launch_in_turn(kernel, dim, sweeps, inputs=inputs, values=[given, wp.clone(given)]).numpy()
+
+
+def follow_surface(surface: Surface, x: np.ndarray) -> np.ndarray:
+    """Returns positions at which the inner vertices of tetrahedra move as those around them move, and none inverts.
+
+    A part with tetrahedra that have inverted, connected by vertices that have moved, is as in the input; other vertices
+    of the surface keep their positions, which are in units, shape [n, 3].
+    """
+    tetrahedra = surface.tetrahedra
+    if not len(tetrahedra):
+        return x
+    is_inner = np.zeros(len(x), dtype=bool)
+    is_inner[tetrahedra] = True
+    is_inner[surface.mesh.vertices] = is_inner[surface.fixed] = False
+    if is_inner.any():
+        moves = np.where(is_inner[:, None], 0.0, x - surface.home)
+        spread = Springs(surface, is_inner).spread(moves, ~is_inner, _INNER_SWEEPS)
+        x = surface.rounded(np.where(is_inner[:, None], surface.home + spread, x))
+    inverted = np.setdiff1d(surface.inverted(x), surface.inverted(surface.home))
+    if not len(inverted):
+        return x
+    moved = differ(x, surface.home)
+    part = connect_cells(surface.edges[moved[surface.edges].all(axis=1)], len(x))
+    restored = np.isin(part, part[tetrahedra[inverted]]) & moved
+    return np.where(restored[:, None], surface.home, x)
 
 
 def _vertices_across(surface: Surface, movable: np.ndarray) -> np.ndarray:

@@ -6,11 +6,11 @@ import numpy as np
 
 from ..detection.at_rest.body_parts import connect_cells
 from .approach import approach, score_of
-from .elastic import Springs, near
+from .elastic import Springs, follow_surface, near
 from .motion import Faults, push_apart
+from .part import Part
 from .sheets import separate_sheets
 from .surface import Surface, differ, sums
-from .tetrahedra import follow_surface
 from .untangle import untangle
 
 _RINGS = 10
@@ -20,7 +20,8 @@ _OFFSET = 0.1
 _FAR = 4.0
 """Move, in edges, above which another order of pieces is tried, which may be nearer."""
 _ROUNDS_CROSSING, _ROUNDS_OF_ORDER = 8, 2
-"""Motions of returns that are hardly the result: of what still crosses, and of what tells which order is the nearer."""
+"""Motions of returns that are hardly the result, of what still crosses or of a part, and of those that tell which order
+is the nearer."""
 _FARTHER = 2.0
 """Squared moves at the start of an order, as a multiple of those that free the other one, above which it is not tried.
 """
@@ -47,6 +48,8 @@ def search(
     before, chosen = Faults(surface, surface.home), np.full(len(surface.home), -1)
     if not before:
         return before, before, chosen
+    if history is None and sheet is None and (found := _found_in_part(surface, before, max_strain)) is not None:
+        return before, found, chosen
     after = Faults(surface, _found(surface, before, max_strain, history, sheet, chosen))
     if after.count:
         restored = Faults(surface, _restored(surface, before, after))
@@ -55,6 +58,19 @@ def search(
     if after.are_fewer(before) and not surface.is_wrecked(after.x):
         return before, after, chosen
     return before, before, np.full_like(chosen, -1)
+
+
+def _found_in_part(surface: Surface, before: Faults, max_strain: float) -> Faults | None:
+    """Returns what is wrong with positions, nothing, that only the part around contours is searched for, or None."""
+    part = Part.around(surface, before.crossings)
+    if part is None:
+        return None
+    x, springs = _opened(part, part.home, part.crossings(part.home), None)
+    if len(part.crossings(x)) or not part.is_apart(x):
+        return None
+    x = approach(part, x, springs, max_strain, _ROUNDS_CROSSING)
+    found = Faults(surface, part.in_whole(x)) if part.is_apart(x) and part.strain(x) <= max_strain else None
+    return None if found else found
 
 
 def _found(surface: Surface, before: Faults, max_strain: float, history, sheet, chosen: np.ndarray) -> np.ndarray:
