@@ -45,7 +45,7 @@ from .distance import closest_points
 from .motion import Query, double, query_motion
 from .pairs import distance_of_corners, firsts_of, form_of
 from .polynomials import EDGE_EDGE
-from .signs import FREE, HIT, ROUNDOFF, UNSURE
+from .signs import FREE, HALF, HIT, ONE, ROUNDOFF, TWO, UNSURE, ZERO
 from .time_of_impact import Impact
 
 POSITION_ERROR = 8.0
@@ -72,13 +72,9 @@ _UP = wp.constant(wp.float64(1.0 + 2.0**-40))
 """Raises a few rounded operations above their exact result."""
 _TINY = wp.constant(wp.float64(2.0**-1000))
 _STEPS_OF_ROUNDING = wp.constant(wp.float64(32.0))
-_ZERO = wp.constant(wp.float64(0.0))
 _AHEAD = wp.constant(wp.float64(3.0))
 """Deviations that a part is expected to close; where motion goes on evenly, two remain."""
 _EIGHTH = wp.constant(wp.float64(0.125))
-_HALF = wp.constant(wp.float64(0.5))
-_ONE = wp.constant(wp.float64(1.0))
-_TWO = wp.constant(wp.float64(2.0))
 
 
 @wp.func
@@ -93,17 +89,17 @@ def on_arc(x0: Any, x1: Any, centre: wp.vec3d, turn: wp.vec3d, time: wp.float64)
         time: The time, 0 at the start and 1 at the end; 1 - time is exact.
     """
     start = double(x0)
-    straight = (_ONE - time) * start + time * double(x1)
+    straight = (ONE - time) * start + time * double(x1)
     angle = wp.length(turn)
-    if angle == _ZERO:
+    if angle == ZERO:
         return straight
     axis = turn / angle
     across = wp.cross(axis, start - centre)
     inward = wp.cross(axis, across)
-    half = wp.sin(_HALF * (time * angle))
-    whole_half = wp.sin(_HALF * angle)
+    half = wp.sin(HALF * (time * angle))
+    whole_half = wp.sin(HALF * angle)
     sine = wp.sin(time * angle) - time * wp.sin(angle)
-    versine = _TWO * (half * half - time * (whole_half * whole_half))
+    versine = TWO * (half * half - time * (whole_half * whole_half))
     return straight + (sine * across + versine * inward)
 
 
@@ -145,8 +141,8 @@ def turns(arcs: Arcs, v: wp.vec4i) -> bool:
     """Returns whether one of the vertices of a pair turns."""
     if not any_turns(arcs):
         return False
-    straight = arcs.deviation[v[0]] == _ZERO and arcs.deviation[v[1]] == _ZERO
-    return not (straight and arcs.deviation[v[2]] == _ZERO and arcs.deviation[v[3]] == _ZERO)
+    straight = arcs.deviation[v[0]] == ZERO and arcs.deviation[v[1]] == ZERO
+    return not (straight and arcs.deviation[v[2]] == ZERO and arcs.deviation[v[3]] == ZERO)
 
 
 @wp.func
@@ -165,14 +161,14 @@ def arc_bounds(x0: wp.vec3d, x1: wp.vec3d, centre: wp.vec3d, turn: wp.vec3d) -> 
     """
     angle = wp.length(turn)
     rounding = _POSITION_ERROR * wp.sqrt(wp.float64(3.0)) * wp.max(wp.max(wp.abs(x0)), wp.max(wp.abs(x1)))
-    if angle == _ZERO:
-        return wp.vec3d(_ZERO, _ZERO, _UP * (_UNIT * rounding) + _TINY)
+    if angle == ZERO:
+        return wp.vec3d(ZERO, ZERO, _UP * (_UNIT * rounding) + _TINY)
     r = x0 - centre
     size = _UP * wp.length(r)
     lever = wp.length(wp.cross(turn / angle, r)) + _LEVER_LENGTH_ERROR * _UNIT * size
     rounding += (_LEVER_ERROR + _TURN_ERROR * angle) * size
     sagitta = _EIGHTH * (angle * angle) * lever
-    return _UP * wp.vec3d(sagitta, _TWO * lever, _UNIT * rounding) + wp.vec3d(_ZERO, _ZERO, _TINY)
+    return _UP * wp.vec3d(sagitta, TWO * lever, _UNIT * rounding) + wp.vec3d(ZERO, ZERO, _TINY)
 
 
 @wp.func
@@ -234,7 +230,7 @@ def _bounds_of_pair(kind: int, v: wp.vec4i, largest: wp.float64, arcs: Arcs) -> 
         else:
             bounds.second = wp.max(bounds.second, arcs.bounds[v[j]])
     bounds.rounding = bounds.first[2] + bounds.second[2]
-    tolerance = wp.where(arcs.tolerance > _ZERO, arcs.tolerance, DEFAULT_TOLERANCE * largest)
+    tolerance = wp.where(arcs.tolerance > ZERO, arcs.tolerance, DEFAULT_TOLERANCE * largest)
     bounds.tolerance = wp.max(tolerance, _STEPS_OF_ROUNDING * bounds.rounding)
     return bounds
 
@@ -260,7 +256,7 @@ def _closing_way(kind: int, part: Impact, chords: Query) -> wp.float64:
 def _first_contact(kind: int, part: Impact, chords: Query, rounding: wp.float64) -> Impact:
     """Returns the contact of a part with coordinates and normal as of contacts on straight paths."""
     result = part
-    motion = query_motion(kind, chords, _ZERO)
+    motion = query_motion(kind, chords, ZERO)
     coordinates, normal = contact_at(motion, part.toi)
     result.coordinates = coordinates
     # where paths graze, velocities do not tell the side, but all until the part began is free
@@ -297,10 +293,10 @@ def impact_on_arcs(kind: int, v: wp.vec4i, query: Query, arcs: Arcs, min_distanc
         end = start + length
         for j in range(4):
             chords[4 + j] = query[4 + j]
-            if end < _ONE:
+            if end < ONE:
                 chords[4 + j] = on_arc_of(arcs, v[j], query[j], query[4 + j], end)
         deviation = distance_of_corners(kind, v, arcs.deviation)
-        if length < _ONE:
+        if length < ONE:
             deviation = _sagittas(bounds, length) + bounds.rounding
         within = _UP * (min_distance + deviation)
         p, q, r, s = chords[0], chords[1], chords[2], chords[3]
@@ -311,26 +307,26 @@ def impact_on_arcs(kind: int, v: wp.vec4i, query: Query, arcs: Arcs, min_distanc
             start = end
             for j in range(4):
                 chords[j] = chords[4 + j]
-            length = wp.min(_TWO * length, _ONE - start)
-            if start >= _ONE:
+            length = wp.min(TWO * length, ONE - start)
+            if start >= ONE:
                 result.status = FREE
-                result.toi = _TWO
+                result.toi = TWO
                 searching = False
         else:
             if parts == 1:  # most pairs need no more than the first part
-                largest = _ZERO
+                largest = ZERO
                 for j in range(8):
                     largest = wp.max(largest, wp.max(wp.abs(query[j])))
                 bounds = _bounds_of_pair(kind, v, largest, arcs)
             advance = _SHORTEST * wp.floor(part.toi * length / _SHORTEST)
-            found = _ZERO
-            if advance == _ZERO:
+            found = ZERO
+            if advance == ZERO:
                 found, _error = distance_at(kind, p, q, r, s)
-            is_within = advance == _ZERO and found <= min_distance + _HALF * bounds.tolerance
-            is_within = is_within or _TWO * deviation <= bounds.tolerance
+            is_within = advance == ZERO and found <= min_distance + HALF * bounds.tolerance
+            is_within = is_within or TWO * deviation <= bounds.tolerance
             if is_within or parts == MAX_PARTS or length <= _SHORTEST:
                 result = part
-                if min_distance == _ZERO and kind <= EDGE_EDGE:
+                if min_distance == ZERO and kind <= EDGE_EDGE:
                     result = _first_contact(kind, part, chords, bounds.rounding)
                 result.status = wp.where(is_within, HIT, UNSURE)
                 result.within_tolerance = wp.where(is_within, 1, 0)
@@ -338,19 +334,19 @@ def impact_on_arcs(kind: int, v: wp.vec4i, query: Query, arcs: Arcs, min_distanc
                 searching = False
             else:
                 speed = _closing_way(kind, part, chords) / length
-                length = _HALF * length
-                if advance > _ZERO:
+                length = HALF * length
+                if advance > ZERO:
                     # arcs are at most two deviations apart then, and about to meet: a part as long as that takes
                     expected = _SHORTEST * wp.floor(_AHEAD * deviation / speed / _SHORTEST)
-                    if expected > _ZERO:
+                    if expected > ZERO:
                         length = wp.min(length, expected)
                     start += advance
-                    length = wp.min(length, _ONE - start)
+                    length = wp.min(length, ONE - start)
                     for j in range(4):
                         chords[j] = on_arc_of(arcs, v[j], query[j], query[4 + j], start)
                 else:
                     # the first part that may be free at all
-                    needed = _HALF * (found - min_distance) - bounds.rounding
+                    needed = HALF * (found - min_distance) - bounds.rounding
                     while length > _SHORTEST and needed < _sagittas(bounds, length):
-                        length = _HALF * length
+                        length = HALF * length
     return result

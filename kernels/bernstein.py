@@ -7,8 +7,7 @@ division (supplement, Sec. 4).
 
 import warp as wp
 
-TWO = wp.constant(wp.float64(2.0))
-THREE = wp.constant(wp.float64(3.0))
+from .signs import THREE, TWO
 
 
 @wp.func

@@ -12,12 +12,11 @@ from .gradients import with_gradients
 from .min_distance import min_distance_impact
 from .motion import Query, all_finite, motion_and_distance, query_motion, query_of
 from .polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_FACE, VERTEX_VERTEX, Motion, coplanarity
-from .signs import FREE, ROUNDOFF, UNSURE, certified_sign_cubic
+from .signs import FREE, ROUNDOFF, UNSURE, ZERO, certified_sign_cubic
 from .time_of_impact import Impact, impact
 
 _TOLERANCE = wp.constant(wp.float64(2.0**-20))
 _NAN = wp.constant(wp.float64(math.nan))
-_ZERO = wp.constant(wp.float64(0.0))
 
 
 @wp.func
@@ -165,7 +164,7 @@ def impact_at_distance(
     a point or the distance is not finite, or the distance negative, the status is UNSURE.
     """
     result = Impact()
-    if not (all_finite(a0, b0, c0, d0, a1, b1, c1, d1) and wp.isfinite(min_distance) and min_distance >= _ZERO):
+    if not (all_finite(a0, b0, c0, d0, a1, b1, c1, d1) and wp.isfinite(min_distance) and min_distance >= ZERO):
         result.status = UNSURE
         result.coordinates = wp.vec3d(_NAN)
         result.normal = wp.vec3d(_NAN)

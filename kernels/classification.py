@@ -7,9 +7,8 @@ from .closest import between, closest_coordinates
 from .culling import direction_separates
 from .polynomials import Coplanarity, InsideTests, Motion, inside_tests, largest_axis
 from .roots import TWO_EXTREMA, UNKNOWN, count_roots, curve_class, largest, quadratic_signs
-from .signs import FREE, HIT, UNSURE, certified_sign, certified_sign_cubic, certified_sign_quadratic
+from .signs import FREE, HIT, UNSURE, ZERO, certified_sign, certified_sign_cubic, certified_sign_quadratic
 
-_ZERO = wp.constant(wp.float64(0.0))
 TINY = wp.constant(wp.float64(2.0**-80))
 SPLIT_ERROR = wp.constant(wp.float64(2.5))
 
@@ -125,7 +124,7 @@ def _weakly_inside(a: wp.float64, b: wp.float64, c: wp.float64, d: wp.float64) -
     """Returns whether inside tests at one time have one weak sign, and not all are zero."""
     low = wp.min(wp.min(a, b), wp.min(c, d))
     high = wp.max(wp.max(a, b), wp.max(c, d))
-    return (low >= _ZERO and high > _ZERO) or (high <= _ZERO and low < _ZERO)
+    return (low >= ZERO and high > ZERO) or (high <= ZERO and low < ZERO)
 
 
 @wp.func
@@ -135,8 +134,8 @@ def _touches(k: wp.vec4d, tests: InsideTests) -> bool:
     q1 = tests.q1
     q2 = tests.q2
     q3 = tests.q3
-    starts = k[0] == _ZERO and _weakly_inside(q0[0], q1[0], q2[0], q3[0])
-    ends = k[3] == _ZERO and _weakly_inside(q0[2], q1[2], q2[2], q3[2])
+    starts = k[0] == ZERO and _weakly_inside(q0[0], q1[0], q2[0], q3[0])
+    ends = k[3] == ZERO and _weakly_inside(q0[2], q1[2], q2[2], q3[2])
     return starts or ends
 
 
@@ -144,13 +143,13 @@ def _touches(k: wp.vec4d, tests: InsideTests) -> bool:
 def _without_zeros(k: wp.vec4d) -> wp.vec4d:
     """Returns the cubic with zeros at its ends moved, far less than a rounding, to the sign of the next coefficient."""
     tiny = TINY * largest(k)
-    start = wp.where(k[1] != _ZERO, k[1], wp.where(k[2] != _ZERO, k[2], k[3]))
-    end = wp.where(k[2] != _ZERO, k[2], wp.where(k[1] != _ZERO, k[1], k[0]))
+    start = wp.where(k[1] != ZERO, k[1], wp.where(k[2] != ZERO, k[2], k[3]))
+    end = wp.where(k[2] != ZERO, k[2], wp.where(k[1] != ZERO, k[1], k[0]))
     return wp.vec4d(
-        wp.where(k[0] == _ZERO, wp.where(start < _ZERO, -tiny, tiny), k[0]),
+        wp.where(k[0] == ZERO, wp.where(start < ZERO, -tiny, tiny), k[0]),
         k[1],
         k[2],
-        wp.where(k[3] == _ZERO, wp.where(end < _ZERO, -tiny, tiny), k[3]),
+        wp.where(k[3] == ZERO, wp.where(end < ZERO, -tiny, tiny), k[3]),
     )
 
 
@@ -172,14 +171,14 @@ def classify(motion: Motion, y: Coplanarity) -> int:
     status = UNSURE
     for _ in range(2):
         status = classify_with(k, y.bound, tests)
-        if status != UNSURE or motion.roundoff > _ZERO:
+        if status != UNSURE or motion.roundoff > ZERO:
             return status
-        if k[0] != _ZERO and k[3] != _ZERO:
+        if k[0] != ZERO and k[3] != ZERO:
             break
         if _touches(k, tests):
             return HIT
         k = _without_zeros(k)
-        if certified_sign_cubic(k, _ZERO) != 0:
+        if certified_sign_cubic(k, ZERO) != 0:
             return FREE
     u = motion.u0 + motion.u1
     v = motion.v0 + motion.v1

@@ -10,9 +10,8 @@ import warp as wp
 
 from .boxes import boxes_apart
 from .polynomials import VERTEX_FACE, Motion
-from .signs import UNDERFLOW
+from .signs import HALF, UNDERFLOW
 
-_HALF = wp.constant(wp.float64(0.5))
 _THIRD = wp.constant(wp.float64(1.0 / 3.0))
 DIRECTION_ERROR = wp.constant(wp.float64(10.0))
 
@@ -89,4 +88,4 @@ def centroid_direction(motion: Motion) -> wp.vec3d:
     v = motion.v0 + motion.v1
     if motion.kind == VERTEX_FACE:
         return w - _THIRD * (u + v)
-    return w + _HALF * (v - u)
+    return w + HALF * (v - u)

@@ -26,11 +26,9 @@ from .distance import nearest_pair
 from .gradients import MIN_SQUARE_LENGTH, SQUARE_SINE
 from .motion import Query, query_motion
 from .polynomials import VERTEX_FACE, Motion
-from .signs import FREE
+from .signs import FREE, ONE, ZERO
 from .time_of_impact import Impact, clamped_tolerance, mix_vector
 
-_ZERO = wp.constant(wp.float64(0.0))
-_ONE = wp.constant(wp.float64(1.0))
 _NEWTON_STEPS = wp.constant(8)
 _CONVERGED = wp.constant(wp.float64(2.0**-40))
 
@@ -51,7 +49,7 @@ def _reach(motion: Motion, distance: wp.float64, found: Impact, tolerance: wp.fl
     reach = _Reach()
     reach.time = found.toi
     reach.grazing = 1
-    last = wp.min(found.toi + clamped_tolerance(tolerance), _ONE)
+    last = wp.min(found.toi + clamped_tolerance(tolerance), ONE)
     steps = int(_NEWTON_STEPS)  # not a constant, as the body would be repeated
     for i in range(steps):
         t = reach.time
@@ -62,7 +60,7 @@ def _reach(motion: Motion, distance: wp.float64, found: Impact, tolerance: wp.fl
         at = wp.vec2d(nearest[0], nearest[1])
         gap = between(motion.kind, at, u, v, w)
         size = wp.length(gap)
-        if size == _ZERO:
+        if size == ZERO:
             reach.slope = wp.vec3d()
             return reach
         normal = gap / size
@@ -70,16 +68,16 @@ def _reach(motion: Motion, distance: wp.float64, found: Impact, tolerance: wp.fl
         speed = wp.dot(normal, velocity)
         slowest = SQUARE_SINE * wp.max(wp.length_sq(velocity), MIN_SQUARE_LENGTH)
         approach = speed / wp.max(speed * speed, slowest)
-        reach.weights = wp.vec4d(_ONE, at[0] + at[1] - _ONE, -at[0], -at[1])
+        reach.weights = wp.vec4d(ONE, at[0] + at[1] - ONE, -at[0], -at[1])
         if motion.kind != VERTEX_FACE:
-            reach.weights = wp.vec4d(_ONE - at[0], at[0], at[1] - _ONE, -at[1])
+            reach.weights = wp.vec4d(ONE - at[0], at[0], at[1] - ONE, -at[1])
         reach.slope = -approach * normal
         step = (distance - size) * approach
-        if i == 0 and t == _ZERO and size < distance:  # from the start
+        if i == 0 and t == ZERO and size < distance:  # from the start
             reach.slope = wp.vec3d()
             return reach
         if wp.abs(step) <= _CONVERGED:
-            certain = found.within_tolerance == 1 and speed < _ZERO and speed * speed >= slowest
+            certain = found.within_tolerance == 1 and speed < ZERO and speed * speed >= slowest
             reach.grazing = wp.where(certain, 0, 1)
             return reach
         reach.time = wp.clamp(t + step, found.toi, last)
@@ -107,8 +105,8 @@ def with_distance_gradients(
     if found.status != FREE:
         result.grazing = 1
         if wp.isfinite(query):
-            motion = query_motion(kind, query, _ZERO)
-            if motion.scale > _ZERO:
+            motion = query_motion(kind, query, ZERO)
+            if motion.scale > ZERO:
                 result.grazing = _reach(motion, distance * motion.scale, found, tolerance).grazing
     return result
 
@@ -118,11 +116,11 @@ def _adjoint_of_with_distance_gradients(
     kind: int, query: Query, distance: wp.float64, found: Impact, tolerance: wp.float64, adj_ret: Impact
 ):
     if found.status != FREE and wp.isfinite(query):
-        motion = query_motion(kind, query, _ZERO)
-        if motion.scale > _ZERO:
+        motion = query_motion(kind, query, ZERO)
+        if motion.scale > ZERO:
             reach = _reach(motion, distance * motion.scale, found, tolerance)
             slope = adj_ret.toi * motion.scale * reach.slope
-            before = _ONE - reach.time
+            before = ONE - reach.time
             after = reach.time
             gradient = Query()
             for i in range(4):

@@ -47,11 +47,9 @@ from .bernstein import mix, restrict_cubic
 from .custom_gradients import func_grad
 from .motion import Query, query_motion
 from .polynomials import VERTEX_FACE, Motion, coplanarity
-from .signs import FREE
+from .signs import FREE, ONE, ZERO
 from .time_of_impact import Impact, approximate_root, clamped_tolerance, mix_vector
 
-_ZERO = wp.constant(wp.float64(0.0))
-_ONE = wp.constant(wp.float64(1.0))
 SQUARE_SINE = wp.constant(wp.float64(2.0**-20))  # sigma^2
 MIN_SQUARE_LENGTH = wp.constant(wp.float64(2.0**-44))  # f^2
 _NEWTON_STEPS = wp.constant(8)
@@ -102,7 +100,7 @@ def _touch_at(motion: Motion, t: wp.float64, x: wp.float64, y: wp.float64, norma
         at.x = wp.dot(wp.cross(at.v, at.n), w) / square
         at.y = wp.dot(wp.cross(at.n, at.u), w) / square
         at.normal = at.n / wp.sqrt(square)
-        if wp.dot(at.normal, normal) < _ZERO:
+        if wp.dot(at.normal, normal) < ZERO:
             at.normal = -at.normal
         at.grazing = 0
     at.velocity = motion.w1 - motion.w0 - at.x * (motion.u1 - motion.u0) - at.y * (motion.v1 - motion.v0)
@@ -125,12 +123,12 @@ def _touch(motion: Motion, found: Impact, tolerance: wp.float64) -> Touch:
     at = _touch_at(motion, found.toi, x, y, found.normal, found.within_tolerance == 1)
     if at.grazing == 1:
         return at
-    last = wp.min(found.toi + clamped_tolerance(tolerance), _ONE)
+    last = wp.min(found.toi + clamped_tolerance(tolerance), ONE)
     k = restrict_cubic(coplanarity(motion).k, found.toi, last)
-    if k[0] * k[3] < _ZERO:
+    if k[0] * k[3] < ZERO:
         t = mix(found.toi, last, approximate_root(k))
         at = _touch_at(motion, t, x, y, found.normal, True)
-    step = _ONE
+    step = ONE
     for _ in range(_NEWTON_STEPS):
         gap = mix_vector(motion.w0, motion.w1, at.t) - at.x * at.u - at.y * at.v
         step = wp.dot(at.normal, gap) * at.approach
@@ -138,7 +136,7 @@ def _touch(motion: Motion, found: Impact, tolerance: wp.float64) -> Touch:
         if wp.abs(step) <= _NEWTON_END:
             break
     slopes = wp.vec3d(k[1] - k[0], k[2] - k[1], k[3] - k[2])
-    if wp.abs(step) > _CONVERGED or not (wp.min(slopes) > _ZERO or wp.max(slopes) < _ZERO):
+    if wp.abs(step) > _CONVERGED or not (wp.min(slopes) > ZERO or wp.max(slopes) < ZERO):
         at.grazing = 1
     return at
 
@@ -161,8 +159,8 @@ def with_gradients(kind: int, query: Query, found: Impact, tolerance: wp.float64
     if found.status != FREE:
         result.grazing = 1
         if wp.isfinite(query):
-            motion = query_motion(kind, query, _ZERO)
-            if motion.scale > _ZERO:
+            motion = query_motion(kind, query, ZERO)
+            if motion.scale > ZERO:
                 result.grazing = _touch(motion, found, tolerance).grazing
     return result
 
@@ -170,7 +168,7 @@ def with_gradients(kind: int, query: Query, found: Impact, tolerance: wp.float64
 @func_grad(with_gradients, Impact)
 def _adjoint_of_with_gradients(kind: int, query: Query, found: Impact, tolerance: wp.float64, adj_ret: Impact):
     if found.status != FREE and wp.isfinite(query):
-        motion = query_motion(kind, query, _ZERO)
+        motion = query_motion(kind, query, ZERO)
         at = _touch(motion, found, tolerance)
         # the normal, along u and v, which move with the time
         turn = adj_ret.normal - wp.dot(at.normal, adj_ret.normal) * at.normal
@@ -197,7 +195,7 @@ def _adjoint_of_with_gradients(kind: int, query: Query, found: Impact, tolerance
             adj_a = -(adj_u + adj_w)
             adj_b = adj_u
             adj_c = adj_w - adj_v
-        s = _ONE - at.t
+        s = ONE - at.t
         wp.adjoint[query] += wp.matrix_from_rows(
             s * adj_a, s * adj_b, s * adj_c, s * adj_d, at.t * adj_a, at.t * adj_b, at.t * adj_c, at.t * adj_d
         )

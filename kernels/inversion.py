@@ -14,12 +14,9 @@ from .bernstein import restrict_cubic
 from .custom_gradients import func_grad
 from .motion import Query, query_motion, query_of
 from .polynomials import VERTEX_FACE, coplanarity
-from .signs import FREE, HIT, ROUNDOFF, UNSURE, certified_sign, certified_sign_cubic
+from .signs import FREE, HALF, HIT, ONE, ROUNDOFF, UNSURE, ZERO, certified_sign, certified_sign_cubic
 from .time_of_impact import FINEST, MAX_VISITS, clamped_tolerance, power_of_two
 
-_ZERO = wp.constant(wp.float64(0.0))
-_HALF = wp.constant(wp.float64(0.5))
-_ONE = wp.constant(wp.float64(1.0))
 _NEVER = wp.constant(wp.float64(2.0))
 _RESTRICTION = wp.constant(wp.float64(2.0))
 """Bound after restriction, in bounds of the coefficients: it interpolates thrice, 9r k <= E, see :mod:`.roots`."""
@@ -68,18 +65,18 @@ def first_inversion(tetrahedron: Query, roundoff: wp.float64, tolerance: wp.floa
         result.status = HIT
     length = power_of_two(clamped_tolerance(tolerance))
     shortest = FINEST * length
-    start = _ZERO
-    end = _ONE
+    start = ZERO
+    end = ONE
     for _ in range(MAX_VISITS):
         k = restrict_cubic(y.k, start, end)
         width = end - start
         if certified_sign_cubic(k, bound) > 0:
-            if end == _ONE:
+            if end == ONE:
                 result.status = FREE
                 result.toi = _NEVER
                 return result
             start = end
-            end = wp.min(end + width + width, _ONE)
+            end = wp.min(end + width + width, ONE)
         else:
             is_negative = certified_sign(k[0], bound) < 0 or certified_sign(k[3], bound) < 0
             if is_negative:
@@ -89,7 +86,7 @@ def first_inversion(tetrahedron: Query, roundoff: wp.float64, tolerance: wp.floa
                 break
             if width <= shortest:
                 break
-            end = start + shortest * wp.floor(_HALF * width / shortest)
+            end = start + shortest * wp.floor(HALF * width / shortest)
     result.toi = start
     return result
 

@@ -30,7 +30,7 @@ from .culling import DIRECTION_ERROR, centroid_direction
 from .distance import nearest_pair
 from .polynomials import VERTEX_EDGE, VERTEX_FACE, VERTEX_VERTEX, Motion, coplanarity
 from .separation_proof import POINT_ERROR, direction_clears, norm_bound, plane_clears, polygon_clears, sum_of_size
-from .signs import FREE, HIT, UNDERFLOW, UNSURE
+from .signs import FREE, HALF, HIT, ONE, THREE, TWO, UNDERFLOW, UNSURE, ZERO
 from .time_of_impact import Impact, clamped_tolerance, mix_vector, power_of_two, restrict_motion
 
 SHORTEST = wp.constant(wp.float64(2.0**-40))
@@ -40,12 +40,7 @@ MAX_VISITS = wp.constant(128)
 MAX_ADVANCES = wp.constant(12)
 """Number of times after which advancement is given up."""
 
-_ZERO = wp.constant(wp.float64(0.0))
-_HALF = wp.constant(wp.float64(0.5))
 _AHEAD = wp.constant(wp.float64(0.75))
-_ONE = wp.constant(wp.float64(1.0))
-_TWO = wp.constant(wp.float64(2.0))
-_THREE = wp.constant(wp.float64(3.0))
 _NEWTON_STEPS = wp.constant(3)
 _PLANE_NEWTON_STEPS = wp.constant(6)
 _STEPS_TO_PLANE = wp.constant(3)
@@ -101,11 +96,11 @@ def _about_reached(
         velocity = between(motion.kind, at, motion.u1 - motion.u0, motion.v1 - motion.v0, motion.w1 - motion.w0)
         size = wp.length(gap)
         slope = wp.dot(gap, velocity)
-        if slope == _ZERO:
-            return _TWO
+        if slope == ZERO:
+            return TWO
         time += (distance - size) * size / slope
         if not (time >= start and time <= end):
-            return _TWO
+            return TWO
         at, gap = _nearest_at(motion, time)
     return time
 
@@ -124,7 +119,7 @@ def _is_within(motion: Motion, gap: wp.vec3d, distance: wp.float64) -> bool:
 @wp.func
 def _underflow(roundoff: wp.float64) -> wp.float64:
     """Returns an upper bound of the underflow of the squares in a norm; 0 for a roundoff of 0."""
-    return wp.where(roundoff > _ZERO, UNDERFLOW, _ZERO)
+    return wp.where(roundoff > ZERO, UNDERFLOW, ZERO)
 
 
 @wp.func
@@ -136,11 +131,11 @@ def closest_at(kind: int, motion: Motion, time: wp.float64):
     the first. If the points touch, it is that of :func:`.contact_at`.
     """
     at, gap = _nearest_at(motion, time)
-    coordinates = wp.vec3d(at[0], at[1], _ZERO)
+    coordinates = wp.vec3d(at[0], at[1], ZERO)
     if kind == VERTEX_FACE:
-        coordinates = wp.vec3d(_ONE - at[0] - at[1], at[0], at[1])
+        coordinates = wp.vec3d(ONE - at[0] - at[1], at[0], at[1])
     elif kind == VERTEX_EDGE:
-        coordinates = wp.vec3d(at[0], _ZERO, _ZERO)
+        coordinates = wp.vec3d(at[0], ZERO, ZERO)
     elif kind == VERTEX_VERTEX:
         coordinates = wp.vec3d()
     size = wp.max(wp.abs(gap))
@@ -174,13 +169,13 @@ def begin_search(motion: Motion, distance: wp.float64, tolerance: wp.float64) ->
     """Returns the search of :func:`min_distance_impact`, whose arguments these are, before its first part."""
     search = Search()
     search.length = clamped_tolerance(tolerance)
-    search.near = wp.where(distance >= SMALLEST, distance, _ZERO)
+    search.near = wp.where(distance >= SMALLEST, distance, ZERO)
     search.far = wp.max(distance, SMALLEST)
-    if motion.roundoff == _ZERO:
+    if motion.roundoff == ZERO:
         search.near = distance
         search.far = distance
-    search.width = _ONE
-    search.limit = _ONE
+    search.width = ONE
+    search.limit = ONE
     search.time = _UNKNOWN
     search.status = UNSURE
     return search
@@ -196,25 +191,25 @@ def _plane_reached(motion: Motion, distance: wp.float64, time: wp.float64) -> wp
         The time, any number, not finite where that leads nowhere.
     """
     y = coplanarity(motion)
-    linear = _THREE * (y.k[1] - y.k[0])
-    square = _THREE * (y.k[2] - _TWO * y.k[1] + y.k[0])
-    cube = y.k[3] - y.k[0] + _THREE * (y.k[1] - y.k[2])
+    linear = THREE * (y.k[1] - y.k[0])
+    square = THREE * (y.k[2] - TWO * y.k[1] + y.k[0])
+    cube = y.k[3] - y.k[0] + THREE * (y.k[1] - y.k[2])
     reached = time
     for step in range(_PLANE_NEWTON_STEPS):
         t = reached
         value = y.k[0] + t * (linear + t * (square + t * cube))
-        slope = linear + t * (_TWO * square + t * _THREE * cube)
+        slope = linear + t * (TWO * square + t * THREE * cube)
         if step < _STEPS_TO_PLANE:
             reached = t - value / slope
         else:
-            s = _ONE - t
-            normal = s * s * y.n0 + _TWO * s * t * y.nh + t * t * y.n1
+            s = ONE - t
+            normal = s * s * y.n0 + TWO * s * t * y.nh + t * t * y.n1
             turn = s * (y.nh - y.n0) + t * (y.n1 - y.nh)
-            side = wp.where(slope < _ZERO, _ONE, -_ONE)  # from which Y approaches zero
+            side = wp.where(slope < ZERO, ONE, -ONE)  # from which Y approaches zero
             size = wp.length(normal)
             # of side Y - d |n|
             reached = t - (side * value - distance * size) * size / (
-                side * slope * size - _TWO * distance * wp.dot(normal, turn)
+                side * slope * size - TWO * distance * wp.dot(normal, turn)
             )
     return reached
 
@@ -229,12 +224,12 @@ def _lowest_at(
     time: wp.float64,
 ) -> wp.float64:
     """Returns the smallest product of a corner of the polygon with a direction at a time."""
-    both = wp.vec2d(_ONE - time, time)
+    both = wp.vec2d(ONE - time, time)
     a = wp.dot(u, both)
     b = wp.dot(v, both)
     if kind == VERTEX_FACE:
-        return wp.dot(w, both) - wp.max(wp.max(a, b), _ZERO)
-    return wp.dot(w, both) - wp.max(a, _ZERO) + wp.min(b, _ZERO)
+        return wp.dot(w, both) - wp.max(wp.max(a, b), ZERO)
+    return wp.dot(w, both) - wp.max(a, ZERO) + wp.min(b, ZERO)
 
 
 @wp.func
@@ -267,8 +262,8 @@ def _cleared_until(motion: Motion, direction: wp.vec3d, start: wp.float64, dista
     if not _lowest_at(motion.kind, u, v, w, start) - bound > needed:
         return start
     # not certain, but checked: a little more than needed
-    more = needed * AWAY + _TWO * bound
-    end = _first_below(w - u, more, _first_below(w, more, _ONE))
+    more = needed * AWAY + TWO * bound
+    end = _first_below(w - u, more, _first_below(w, more, ONE))
     if motion.kind == VERTEX_FACE:
         end = _first_below(w - v, more, end)
     else:
@@ -290,10 +285,10 @@ def advance(motion: Motion, distance: wp.float64, timed: bool, before: Search) -
     first = search.visits == 0
     time = search.time
     if time < start:
-        reached = _plane_reached(motion, distance, wp.where(first, _HALF, start))
-        time = SHORTEST * wp.floor((reached + _HALF * search.length) / SHORTEST)
+        reached = _plane_reached(motion, distance, wp.where(first, HALF, start))
+        time = SHORTEST * wp.floor((reached + HALF * search.length) / SHORTEST)
         if not (time > start and time < limit):
-            time = wp.where(first, _HALF, start)
+            time = wp.where(first, HALF, start)
     u = mix_vector(motion.u0, motion.u1, time)
     v = mix_vector(motion.v0, motion.v1, time)
     w = mix_vector(motion.w0, motion.w1, time)
@@ -302,7 +297,7 @@ def advance(motion: Motion, distance: wp.float64, timed: bool, before: Search) -
     velocity = between(motion.kind, at, motion.u1 - motion.u0, motion.v1 - motion.v0, motion.w1 - motion.w0)
     size = wp.length(gap)
     reached = time + (distance - size) * size / wp.dot(gap, velocity)
-    reached = SHORTEST * wp.floor((reached + _HALF * search.length) / SHORTEST)
+    reached = SHORTEST * wp.floor((reached + HALF * search.length) / SHORTEST)
     if _is_within(motion, gap, search.near):
         limit = time
         search.limit = time
@@ -344,7 +339,7 @@ def visit_part(kind: int, motion: Motion, distance: wp.float64, timed: bool, bef
     limit = search.limit
     end = wp.min(start + search.width, limit)
     span = end - start
-    time = start + SHORTEST * wp.floor(_HALF * span / SHORTEST)
+    time = start + SHORTEST * wp.floor(HALF * span / SHORTEST)
     at, gap = _nearest_at(motion, time)
     if _is_within(motion, gap, search.near):
         search.limit = time
@@ -355,7 +350,7 @@ def visit_part(kind: int, motion: Motion, distance: wp.float64, timed: bool, bef
         part = restrict_motion(motion, start, end)
         if direction_clears(part, unit_scale(gap), search.far) or polygon_clears(kind, part, at, search.far):
             search.start = end
-            search.width = _TWO * search.width
+            search.width = TWO * search.width
             search.aimed = False
             search.ended = end == limit
             if search.ended and not search.found:
@@ -365,20 +360,20 @@ def visit_part(kind: int, motion: Motion, distance: wp.float64, timed: bool, bef
         else:
             reached = _about_reached(motion, distance, start, limit, time, at, gap)
             is_reached = reached < limit
-            reached = wp.min(SHORTEST * wp.floor((reached + _HALF * search.length) / SHORTEST), limit)
+            reached = wp.min(SHORTEST * wp.floor((reached + HALF * search.length) / SHORTEST), limit)
             # then, in the first part, the ends of the step
             times = wp.where(search.visits == 0, 3, 1)
             for i in range(times):
-                time = wp.where(i == 0, reached, wp.where(i == 1, _ONE, _ZERO))
+                time = wp.where(i == 0, reached, wp.where(i == 1, ONE, ZERO))
                 at, gap = _nearest_at(motion, time)
                 if (i > 0 or is_reached) and _is_within(motion, gap, search.near):
                     search.found = True
                     search.limit = wp.min(search.limit, time)
-                    search.ended = time == _ZERO
+                    search.ended = time == ZERO
             aim = search.limit - _AHEAD * search.length - start
             aim = SHORTEST * wp.floor(aim / SHORTEST)
-            search.aimed = search.found and not search.aimed and aim > _ZERO and aim < span
-            search.width = wp.where(search.aimed, aim, wp.max(_HALF * power_of_two(span), SHORTEST))
+            search.aimed = search.found and not search.aimed and aim > ZERO and aim < span
+            search.width = wp.where(search.aimed, aim, wp.max(HALF * power_of_two(span), SHORTEST))
     search.visits += 1
     if search.found and (not timed or search.limit - search.start <= search.length):
         search.ended = True
@@ -400,10 +395,10 @@ def end_search(kind: int, motion: Motion, search: Search) -> Impact:
     coordinates, normal = closest_at(kind, motion, wp.where(search.found, search.limit, search.start))
     result.coordinates = coordinates
     result.normal = normal
-    if motion.size == _ZERO:  # the features are one point, at any distance of at least 0
+    if motion.size == ZERO:  # the features are one point, at any distance of at least 0
         result.status = HIT
         result.within_tolerance = 1
-        result.toi = _ZERO
+        result.toi = ZERO
     return result
 
 

@@ -25,8 +25,7 @@ Certified signs decide contact for **any** axis and at any time at which Y = 0 (
 
 import warp as wp
 
-from .bernstein import TWO
-from .signs import UNDERFLOW
+from .signs import HALF, TWO, UNDERFLOW
 
 VERTEX_FACE = wp.constant(0)
 EDGE_EDGE = wp.constant(1)
@@ -36,7 +35,6 @@ VERTEX_VERTEX = wp.constant(3)
 """Kind of a query with a minimum distance: its motion is that of a vertex and the collapsed triangle q q q."""
 
 _THIRD = wp.constant(wp.float64(1.0 / 3.0))
-_HALF = wp.constant(wp.float64(0.5))
 COPLANARITY_ERROR = wp.constant(wp.float64(14.0))
 PRODUCT_ERROR = wp.constant(wp.float64(6.0))
 DIFFERENCE_ERROR = wp.constant(wp.float64(7.0))
@@ -87,7 +85,7 @@ class InsideTests:
 @wp.func
 def cross_middle(x0: wp.vec3d, x1: wp.vec3d, y0: wp.vec3d, y1: wp.vec3d) -> wp.vec3d:
     """Returns the middle Bernstein coefficient of x(t) cross y(t): the paper's n-hat, without its cancellation."""
-    return _HALF * (wp.cross(x0, y1) + wp.cross(x1, y0))
+    return HALF * (wp.cross(x0, y1) + wp.cross(x1, y0))
 
 
 @wp.func
@@ -141,7 +139,7 @@ def _cross_component(x0: wp.vec3d, x1: wp.vec3d, y0: wp.vec3d, y1: wp.vec3d, axi
     y1k = component(y1, k)
     return wp.vec3d(
         x0j * y0k - x0k * y0j,
-        _HALF * ((x0j * y1k - x0k * y1j) + (x1j * y0k - x1k * y0j)),
+        HALF * ((x0j * y1k - x0k * y1j) + (x1j * y0k - x1k * y0j)),
         x1j * y1k - x1k * y1j,
     )
 

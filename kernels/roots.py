@@ -11,7 +11,7 @@ module: rounding a number of size c k costs c r k <= c E / 13.
 import warp as wp
 
 from .bernstein import divide_cubic, evaluate_cubic, evaluate_quadratic
-from .signs import UNDERFLOW, certified_sign, certified_sign_quadratic
+from .signs import FOUR, TWO, UNDERFLOW, certified_sign, certified_sign_quadratic
 
 MONOTONE = wp.constant(0)
 """Curve without extremum (case c)."""
@@ -22,8 +22,6 @@ TWO_EXTREMA = wp.constant(2)
 UNKNOWN = wp.constant(-1)
 
 _QUARTER = wp.constant(wp.float64(0.25))
-_TWO = wp.constant(wp.float64(2.0))
-_FOUR = wp.constant(wp.float64(4.0))
 _SIX = wp.constant(wp.float64(6.0))
 _SEVEN = wp.constant(wp.float64(7.0))
 _EIGHT = wp.constant(wp.float64(8.0))
@@ -117,7 +115,7 @@ def count_roots(k: wp.vec4d, bound: wp.float64, shape: int) -> int:
     leading = (d2 - d1) - (d1 - d0)
     spread = wp.abs(leading) + _TURNING * bound
     value = evaluate_cubic(k, a, b)
-    rounding = _TWO * bound * sum * sum * sum + UNDERFLOW * bound
+    rounding = TWO * bound * sum * sum * sum + UNDERFLOW * bound
     deviation = _SEVEN * (_QUARTER * spread) * (_QUARTER * spread) * sum * sum
     if certified_sign(value, rounding) == -start:
         return 2  # a witness between the ends
@@ -166,14 +164,14 @@ def linear_signs(
     s1 = certified_sign(line[1], line_bound)
     if s0 == s1:
         return wp.vec2i(s0, s0)
-    a = wp.where(s0 == 0, _FOUR * line_bound, wp.abs(line[0]))
-    b = wp.where(s1 == 0, _FOUR * line_bound, wp.abs(line[1]))
+    a = wp.where(s0 == 0, FOUR * line_bound, wp.abs(line[0]))
+    b = wp.where(s1 == 0, FOUR * line_bound, wp.abs(line[1]))
     if s0 * s1 == 0 and wp.max(a, b) < _EIGHT * line_bound:
         return wp.vec2i(0, 0)
     sum = a + b
     square = sum * sum
     start = certified_sign(k[0], bound)
-    y_bound = square * (_TWO * bound * sum + _CROSSING * size * line_bound) + UNDERFLOW * bound
+    y_bound = square * (TWO * bound * sum + _CROSSING * size * line_bound) + UNDERFLOW * bound
     side = certified_sign(evaluate_cubic(k, a, b), y_bound) * start
     if side == 0:
         return wp.vec2i(0, 0)
@@ -182,7 +180,7 @@ def linear_signs(
     if side < 0:
         return wp.vec2i(s0, s1)
     d = wp.vec3d(k[1] - k[0], k[2] - k[1], k[3] - k[2])
-    slope_bound = sum * (_TWO * _DIFFERENCE * bound * sum + _SLOPE_CROSSING * size * line_bound) + UNDERFLOW * bound
+    slope_bound = sum * (TWO * _DIFFERENCE * bound * sum + _SLOPE_CROSSING * size * line_bound) + UNDERFLOW * bound
     slope = certified_sign(evaluate_quadratic(d, a, b), slope_bound)
     # Y returns towards zero between its ends: before the extremum its slope has the sign opposite to its own
     before = slope * start

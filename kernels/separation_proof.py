@@ -31,13 +31,8 @@ import warp as wp
 from .closest import unit_scale
 from .culling import gaps_along
 from .polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_VERTEX, Motion, coplanarity, cross_middle, cross_size
-from .signs import UNDERFLOW
+from .signs import FOUR, HALF, ONE, TWO, UNDERFLOW, ZERO
 
-_ZERO = wp.constant(wp.float64(0.0))
-_HALF = wp.constant(wp.float64(0.5))
-_ONE = wp.constant(wp.float64(1.0))
-_TWO = wp.constant(wp.float64(2.0))
-_FOUR = wp.constant(wp.float64(4.0))
 _THIRD = wp.constant(wp.float64(1.0 / 3.0))
 _SIXTH = wp.constant(wp.float64(1.0 / 6.0))
 INFLATED = wp.constant(wp.float64(1.0 + 2.0**-48))
@@ -83,7 +78,7 @@ def plane_clears(part: Motion, distance: wp.float64) -> bool:
     middle = norm_bound(y.nh) + error
     end = norm_bound(y.n1) + error
     needed = (distance * INFLATED) * wp.vec4d(
-        start, (start + _TWO * middle) * _THIRD, (_TWO * middle + end) * _THIRD, end
+        start, (start + TWO * middle) * _THIRD, (TWO * middle + end) * _THIRD, end
     )
     bound = PLANE_ERROR * y.bound
     above = y.k - needed
@@ -116,7 +111,7 @@ def _side_clears(
     c0 = wp.cross(q[0], e[0])
     ch = cross_middle(q[0], q[1], e[0], e[1])
     c1 = wp.cross(q[1], e[1])
-    direction = unit_scale(c0 + _TWO * ch + c1)
+    direction = unit_scale(c0 + TWO * ch + c1)
     c_size = cross_size(size, e_size)
     slack = part.roundoff * UNDERFLOW
     bound = _CROSS_ERROR * part.roundoff * wp.dot(wp.abs(direction), c_size) + slack
@@ -126,7 +121,7 @@ def _side_clears(
     needed = distance * norm_bound(direction) * INFLATED
     if not (
         wp.dot(direction, c0) - bound > needed * start
-        and wp.dot(direction, ch) - bound > needed * (_HALF * (start + end))
+        and wp.dot(direction, ch) - bound > needed * (HALF * (start + end))
         and wp.dot(direction, c1) - bound > needed * end
     ):
         return False
@@ -138,9 +133,9 @@ def _side_clears(
     away = _QUARTIC_ERROR * part.roundoff * wp.dot(c_size, cross_size(i_size, e_size)) + slack
     return (
         wp.dot(c0, k0) >= away
-        and _HALF * (wp.dot(c0, kh) + wp.dot(ch, k0)) >= away
-        and (wp.dot(c0, k1) + _FOUR * wp.dot(ch, kh) + wp.dot(c1, k0)) * _SIXTH >= away
-        and _HALF * (wp.dot(ch, k1) + wp.dot(c1, kh)) >= away
+        and HALF * (wp.dot(c0, kh) + wp.dot(ch, k0)) >= away
+        and (wp.dot(c0, k1) + FOUR * wp.dot(ch, kh) + wp.dot(c1, k0)) * _SIXTH >= away
+        and HALF * (wp.dot(ch, k1) + wp.dot(c1, kh)) >= away
         and wp.dot(c1, k1) >= away
     )
 
@@ -148,7 +143,7 @@ def _side_clears(
 @wp.func
 def _points_away(q: _Ends, e: _Ends, bound: wp.float64) -> bool:
     """Returns whether q.e is certainly not negative over a part, in all its coefficients."""
-    middle = _HALF * (wp.dot(q[0], e[1]) + wp.dot(q[1], e[0]))
+    middle = HALF * (wp.dot(q[0], e[1]) + wp.dot(q[1], e[0]))
     return wp.dot(q[0], e[0]) >= bound and middle >= bound and wp.dot(q[1], e[1]) >= bound
 
 
@@ -190,10 +185,10 @@ def polygon_clears(kind: int, part: Motion, at: wp.vec2d, distance: wp.float64) 
     """
     if kind == VERTEX_VERTEX:
         return False
-    first_low = at[0] <= _ZERO
-    first_high = at[0] >= _ONE
-    second_low = at[1] <= _ZERO
-    second_high = at[1] >= _ONE
+    first_low = at[0] <= ZERO
+    first_high = at[0] >= ONE
+    second_low = at[1] <= ZERO
+    second_high = at[1] >= ONE
     alone = kind == VERTEX_EDGE
     # the corner, both sides at it, and which of these are tried
     u = wp.matrix_from_rows(part.u0, part.u1)
@@ -221,7 +216,7 @@ def polygon_clears(kind: int, part: Motion, at: wp.vec2d, distance: wp.float64) 
             i = v
     else:
         # x = w - beta u - gamma v
-        third = at[0] + at[1] >= _ONE
+        third = at[0] + at[1] >= ONE
         corner = (first_low and second_low) or first_high or second_high
         along_i = not alone and (corner or (first_low and not third))
         along_e = corner or ((third or second_low) and not along_i)

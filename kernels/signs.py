@@ -29,6 +29,9 @@ UNDERFLOW = wp.constant(wp.float64(1.0e-140))
 """Every bound adds this times the roundoff, or times a bound, which is at least as large. The underflow of an operation
 is far below 1e-296: 2^-1022."""
 
+ZERO, HALF, ONE, TWO, THREE, FOUR = (wp.constant(wp.float64(x)) for x in (0.0, 0.5, 1.0, 2.0, 3.0, 4.0))
+"""Numbers in double precision, as kernels need them."""
+
 
 @wp.func
 def certified_sign(value: wp.float64, bound: wp.float64) -> int:

@@ -7,13 +7,13 @@ within rounding, and finds the first contact on the way.
 
 import warp as wp
 
-from .bernstein import THREE, mix, restrict_cubic, restrict_quadratic
+from .bernstein import mix, restrict_cubic, restrict_quadratic
 from .classification import constant_signs, verdict
 from .closest import between, closest_coordinates, contact_at
 from .culling import direction_separates
 from .polynomials import EDGE_EDGE, Coplanarity, Motion, inside_tests, largest_axis
 from .roots import largest
-from .signs import FREE, HIT, UNSURE, certified_sign, certified_sign_cubic
+from .signs import FREE, HALF, HIT, ONE, THREE, UNSURE, ZERO, certified_sign, certified_sign_cubic
 
 MAX_VISITS = wp.constant(256)
 """Number of intervals after which the search stops, unsure."""
@@ -24,9 +24,6 @@ MIN_DIGITS = 10
 FINEST = wp.constant(wp.float64(2.0**-8))
 """Length of the shortest intervals, as a share of the tolerance."""
 
-_ZERO = wp.constant(wp.float64(0.0))
-_HALF = wp.constant(wp.float64(0.5))
-_ONE = wp.constant(wp.float64(1.0))
 _PLANAR = wp.constant(wp.float64(64.0))  # longest interval that ends the search where Y is zero, in tolerances
 _NEWTON_STEPS = wp.constant(12)
 _NEWTON_END = wp.constant(wp.float64(2.0**-40))
@@ -85,7 +82,7 @@ def clamped_tolerance(tolerance: wp.float64) -> wp.float64:
 @wp.func
 def mix_vector(x0: wp.vec3d, x1: wp.vec3d, t: wp.float64) -> wp.vec3d:
     """Returns the position at time t of a point that moves from x0 to x1."""
-    return (_ONE - t) * x0 + t * x1
+    return (ONE - t) * x0 + t * x1
 
 
 @wp.func
@@ -119,9 +116,9 @@ def status_between(motion: Motion, y: Coplanarity, k: wp.vec4d, start: wp.float6
     if certified_sign_cubic(k, k_bound) != 0:
         return FREE
     part = restrict_motion(motion, start, end)
-    u = _HALF * (part.u0 + part.u1)
-    v = _HALF * (part.v0 + part.v1)
-    w = _HALF * (part.w0 + part.w1)
+    u = HALF * (part.u0 + part.u1)
+    v = HALF * (part.v0 + part.v1)
+    w = HALF * (part.w0 + part.w1)
     axis = largest_axis(wp.cross(u, v))
     for attempt in range(3):
         tests = inside_tests(motion, y, axis)
@@ -146,8 +143,8 @@ def status_between(motion: Motion, y: Coplanarity, k: wp.vec4d, start: wp.float6
 @wp.func
 def approximate_root(k: wp.vec4d) -> wp.float64:
     """Returns a root of a cubic with opposite signs at 0 and at 1, by Newton's method with bisection as a safeguard."""
-    low = _ZERO
-    high = _ONE
+    low = ZERO
+    high = ONE
     t = k[0] / (k[0] - k[3])
     for _ in range(_NEWTON_STEPS):
         k01 = mix(k[0], k[1], t)
@@ -158,13 +155,13 @@ def approximate_root(k: wp.vec4d) -> wp.float64:
         value = mix(k012, k123, t)
         if wp.abs(value) <= _NEWTON_END * wp.abs(k[3] - k[0]):
             break
-        if (value > _ZERO) == (k[0] > _ZERO):
+        if (value > ZERO) == (k[0] > ZERO):
             low = t
         else:
             high = t
         t -= value / (THREE * (k123 - k012))
         if not (low < t < high):
-            t = _HALF * (low + high)
+            t = HALF * (low + high)
     return t
 
 
@@ -175,20 +172,20 @@ def approximate_extremum(k: wp.vec4d) -> wp.float64:
     d1 = k[2] - k[1]
     d2 = k[3] - k[2]
     discriminant = d1 * d1 - d0 * d2
-    if discriminant <= _ZERO:
-        return _ZERO
+    if discriminant <= ZERO:
+        return ZERO
     # the root at which the derivative d rises if Y is positive, or falls if Y is negative
-    root = wp.where(k[0] > _ZERO, wp.sqrt(discriminant), -wp.sqrt(discriminant))
+    root = wp.where(k[0] > ZERO, wp.sqrt(discriminant), -wp.sqrt(discriminant))
     b = d0 - d1
-    if b * root >= _ZERO:
-        return wp.clamp((b + root) / (b - d1 + d2), _ZERO, _ONE)
-    return wp.clamp(d0 / (b - root), _ZERO, _ONE)
+    if b * root >= ZERO:
+        return wp.clamp((b + root) / (b - d1 + d2), ZERO, ONE)
+    return wp.clamp(d0 / (b - root), ZERO, ONE)
 
 
 @wp.func
 def approximate_contact_time(k: wp.vec4d) -> wp.float64:
     """Returns an uncertified time in (0, 1) at which a cubic is about zero or nearest to it; 0 or 1 if none."""
-    if k[0] * k[3] < _ZERO:
+    if k[0] * k[3] < ZERO:
         return approximate_root(k)
     return approximate_extremum(k)
 
@@ -196,7 +193,7 @@ def approximate_contact_time(k: wp.vec4d) -> wp.float64:
 @wp.func
 def _first_crossing(before: wp.float64, at_start: wp.float64, at_end: wp.float64) -> wp.float64:
     """Returns when a number that changes linearly falls to zero, if that is earlier than a given time."""
-    if at_end < _ZERO:
+    if at_end < ZERO:
         return wp.min(before, at_start / (at_start - at_end))
     return before
 
@@ -219,7 +216,7 @@ def approximate_meeting_time(motion: Motion, start: wp.float64, end: wp.float64)
     u1 = wp.dot(direction, part.u1)
     v1 = wp.dot(direction, part.v1)
     w1 = wp.dot(direction, part.w1)
-    time = _first_crossing(_first_crossing(_ONE, w0, w1), w0 - u0, w1 - u1)
+    time = _first_crossing(_first_crossing(ONE, w0, w1), w0 - u0, w1 - u1)
     if motion.kind == EDGE_EDGE:
         return _first_crossing(_first_crossing(time, w0 + v0, w1 + v1), w0 - u0 + v0, w1 - u1 + v1)
     return _first_crossing(time, w0 - v0, w1 - v1)
@@ -260,9 +257,9 @@ def first_contact(motion: Motion, y: Coplanarity, status: int, tolerance: wp.flo
     """
     length = power_of_two(clamped_tolerance(tolerance))
     shortest = FINEST * length
-    start = _ZERO
-    end = _ONE
-    root = _ZERO
+    start = ZERO
+    end = ONE
+    root = ZERO
     ahead = bool(False)  # whether a root may be half the tolerance after the end of the interval
     passing = bool(False)  # whether the interval is the one around that root
     halved = bool(False)  # whether the interval is half of an unsure one
@@ -277,7 +274,7 @@ def first_contact(motion: Motion, y: Coplanarity, status: int, tolerance: wp.flo
             high = wp.where(probing, wp.min(root + shortest, end), end)
             k = restrict_cubic(y.k, low, high)
             current = status_between(motion, y, k, low, high)
-        half = shortest * wp.floor(_HALF * width / shortest)
+        half = shortest * wp.floor(HALF * width / shortest)
         is_planar = largest(k) <= _CUBIC_ERROR * y.bound
         if probing:
             if current == UNSURE:
@@ -289,18 +286,18 @@ def first_contact(motion: Motion, y: Coplanarity, status: int, tolerance: wp.flo
         elif current == HIT and width <= length:
             return HIT, start, end
         elif current == FREE:
-            if end == _ONE:
+            if end == ONE:
                 return FREE, wp.float64(2.0), end
             start = end
             width = wp.where(ahead, length, wp.where(halved, width, width + width))
-            end = wp.where(passing, _ONE, wp.min(start + width, _ONE))
+            end = wp.where(passing, ONE, wp.min(start + width, ONE))
             passing = ahead
             ahead = False
             halved = False
             probed = False
         elif width <= shortest or (width <= _PLANAR * length and is_planar):
             return UNSURE, start, end
-        elif start == _ZERO and not probed:
+        elif start == ZERO and not probed:
             probing = True
         else:
             time = wp.float64(0.0)
@@ -312,11 +309,11 @@ def first_contact(motion: Motion, y: Coplanarity, status: int, tolerance: wp.flo
             ahead = False
             passing = False
             halved = False
-            if not (time > _ZERO and time < _ONE) or (probed and width <= length):
+            if not (time > ZERO and time < ONE) or (probed and width <= length):
                 end = start + half
                 halved = True
-            elif root - _HALF * length > start:
-                end = root - _HALF * length
+            elif root - HALF * length > start:
+                end = root - HALF * length
                 ahead = True
             elif width > length:
                 end = start + length
@@ -341,7 +338,7 @@ def impact(motion: Motion, y: Coplanarity, status: int, tolerance: wp.float64) -
     if status == HIT and found == FREE:
         # possible only with signs that floating point computes, roundoff 0: then the only lower bound is 0
         found = UNSURE
-        toi = _ZERO
+        toi = ZERO
     result.status = wp.where(found == UNSURE, status, found)
     result.within_tolerance = wp.where(found == HIT, 1, 0)
     result.toi = toi

@@ -9,10 +9,8 @@ import warp as wp
 
 from ..boxes import BoxRows, boxes_apart, read_box, write_box
 
-WIDTH = 32
+WIDTH = wp.constant(32)
 """Children of a node, and threads of a warp."""
-
-_WIDTH = wp.constant(WIDTH)
 
 
 @wp.func_native(
@@ -139,8 +137,8 @@ def fit_parent(child: int, box: BoxRows, changed: int, parents: HierarchyLevel):
     low1 = _min_of_warp(box[2])
     high1 = -_min_of_warp(-box[3])
     any_changed = _any_of_warp(changed)
-    parent = child / _WIDTH
-    if child % _WIDTH != 0:
+    parent = child / WIDTH
+    if child % WIDTH != 0:
         if child_step() != 1:
             return
         before = read_box(parents.boxes, parent)
@@ -175,7 +173,7 @@ def unseparated_children(clusters: HierarchyLevel, cluster: int, box: BoxRows, l
     """
     found = wp.uint32(0)
     changed = clusters.changed[cluster]
-    count = wp.min(_WIDTH, level.boxes.shape[0] - first)
+    count = wp.min(WIDTH, level.boxes.shape[0] - first)
     for child in range(first_child(), count, child_step()):
         node = first + child
         if not are_apart(box, read_box(level.boxes, node)):
@@ -188,7 +186,7 @@ def unseparated_children(clusters: HierarchyLevel, cluster: int, box: BoxRows, l
 def changed_children(level: HierarchyLevel, first: int):
     """Returns which of 32 nodes of a level, from the first on, have changed, as bits."""
     found = wp.uint32(0)
-    count = wp.min(_WIDTH, level.boxes.shape[0] - first)
+    count = wp.min(WIDTH, level.boxes.shape[0] - first)
     for child in range(first_child(), count, child_step()):
         if level.changed[first + child] != 0:
             found = found | (wp.uint32(1) << wp.uint32(child))

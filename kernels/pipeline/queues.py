@@ -6,67 +6,40 @@ Counts go on where a queue is full, so that they tell how many entries did not f
 import warp as wp
 
 
-@wp.func_native(
-    snippet="""
+def _raising(count: str, number: str, threads: str = "__activemask()") -> str:
+    """Returns the native code that raises a count by one, of a type of ``number``, and returns its old value.
+
+    On a GPU one atomic does so for all threads of a warp that are here, or those of them in the mask ``threads``.
+    """
+    return f"""
 #if defined(__CUDA_ARCH__)
-    // one atomic for all threads of a warp that are here
-    const unsigned mask = __activemask();
+    const unsigned mask = {threads};
     const int lane = threadIdx.x & 31;
     const int leader = __ffs(mask) - 1;
-    unsigned long long base = 0;
+    {number} base = 0;
     if (lane == leader)
-        base = atomicAdd((unsigned long long*)&counts.data[queue], (unsigned long long)__popc(mask));
+        base = atomicAdd(({number}*)&{count}, ({number})__popc(mask));
     base = __shfl_sync(mask, base, leader);
-    return (wp::int64)base + __popc(mask & ((1u << lane) - 1u));
+    return base + __popc(mask & ((1u << lane) - 1u));
 #else
-    return __atomic_fetch_add(&counts.data[queue], (wp::int64)1, __ATOMIC_RELAXED);
+    return __atomic_fetch_add(&{count}, 1, __ATOMIC_RELAXED);
 #endif
 """
-)
+
+
+@wp.func_native(snippet=_raising("counts.data[queue]", "unsigned long long"))
 def take_slot(counts: wp.array[wp.int64], queue: int) -> wp.int64:
     """Raises the count of a queue by one, and returns its old value: the index of the new entry."""
     ...
 
 
-@wp.func_native(
-    snippet="""
-#if defined(__CUDA_ARCH__)
-    // one atomic for all threads of a warp that are here
-    const unsigned mask = __activemask();
-    const int lane = threadIdx.x & 31;
-    const int leader = __ffs(mask) - 1;
-    int base = 0;
-    if (lane == leader)
-        base = atomicAdd(&count.data[0], __popc(mask));
-    base = __shfl_sync(mask, base, leader);
-    return base + __popc(mask & ((1u << lane) - 1u));
-#else
-    return __atomic_fetch_add(&count.data[0], 1, __ATOMIC_RELAXED);
-#endif
-"""
-)
+@wp.func_native(snippet=_raising("count.data[0]", "int"))
 def take_slot_int(count: wp.array[int]) -> int:
     """Raises a count of 32 bits, which a conditional of a CUDA graph can read, by one, and returns its old value."""
     ...
 
 
-@wp.func_native(
-    snippet="""
-#if defined(__CUDA_ARCH__)
-    // one atomic for all threads of a warp that are here and raise the same count
-    const unsigned mask = __match_any_sync(__activemask(), queue);
-    const int lane = threadIdx.x & 31;
-    const int leader = __ffs(mask) - 1;
-    int base = 0;
-    if (lane == leader)
-        base = atomicAdd(&counts.data[queue], __popc(mask));
-    base = __shfl_sync(mask, base, leader);
-    return base + __popc(mask & ((1u << lane) - 1u));
-#else
-    return __atomic_fetch_add(&counts.data[queue], 1, __ATOMIC_RELAXED);
-#endif
-"""
-)
+@wp.func_native(snippet=_raising("counts.data[queue]", "int", "__match_any_sync(__activemask(), queue)"))
 def take_slot_of(counts: wp.array[int], queue: int) -> int:
     """Raises one of several counts of 32 bits by one, and returns its old value."""
     ...

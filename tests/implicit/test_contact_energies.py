@@ -23,8 +23,8 @@ from warp_bsc.implicit.contact.rows import Rows, make_rows, sum_of_corners
 from warp_bsc.implicit.contact.system import Contacts, Unknowns
 from warp_bsc.implicit.elasticity.derivatives import Derivatives, element_energy, find_derivatives, make_derivatives
 from warp_bsc.implicit.elasticity.elements import SIZES, ElementKind, Elements, elements_of_model, kind_of
+from warp_bsc.implicit.gradients.arrays import with_gradient
 from warp_bsc.implicit.gradients.elastic import Elastic
-from warp_bsc.implicit.gradients.elements import with_gradient
 from warp_bsc.response.state.structs import allocate
 
 

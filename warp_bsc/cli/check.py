@@ -4,7 +4,6 @@ import argparse
 import functools
 import json
 from collections import Counter
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from ..bench.tables import Column
 from ..detection.detector import CollisionDetector
 from ..detection.mesh import CollisionMesh
 from ..mesh_files.check import check
+from ..mesh_files.file_scene import FrameMesh
 from ..mesh_files.frames import Frames, find_frames
 from ..mesh_files.mesh_file import MeshScene
 from ..repairing.surface import weld_borders, welded
@@ -97,7 +97,7 @@ def _run(arguments: argparse.Namespace) -> int:
     if arguments.report:
         _report(arguments.report, frames, selection, str(device))
     findings: dict[str, Findings] = {kind: [] for kind in _KINDS if is_motion or kind != "collisions"}
-    named: dict[str, Any] = {name: SimpleNamespace(path=name, name=name) for name in frames.names}
+    named = {name: FrameMesh(name, {}, False) for name in frames.names}
     notes = dict.fromkeys(selection.unmatched([*named.values()]))
     meant, is_meant = Counter(), functools.cache(lambda a, b: selection.meant(named[a], named[b]))
     names = {path: name for paths in frames.paths for path, name in zip(paths, frames.names, strict=True)}

@@ -33,7 +33,7 @@ from .options import (
 from .repair_files import check_page, read_frames, repair_files
 from .repair_run import RepairRun, find
 from .repair_tables import print_repair
-from .replay_options import add_scene_selection, describe_selection, read_scene, read_selection
+from .replay_options import SCENE, describe_selection, read_scene, read_selection
 from .tables import Console
 
 _DESCRIPTION = """\
@@ -88,7 +88,7 @@ def add_to(commands: Commands, summary: str) -> None:
     command.add_argument("scene", metavar="SCENE", nargs="+", help="a USD file, demo, or mesh files, # for digits")
     which = command.add_argument_group("selection")
     add_options(which, {"--keep": patterns("obstacles: prims, and all below, or files that stay; * matches any text")})
-    add_scene_selection(which)
+    add_options(which, SCENE)
     how = command.add_argument_group("repair")
     add_options(
         how,

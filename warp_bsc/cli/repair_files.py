@@ -4,23 +4,22 @@ import argparse
 import contextlib
 import itertools
 import json
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-import warp as wp
 
 from .._atomic_file import STDOUT, OutputFile, naming
 from ..bench.tables import LONGEST, Column, count
 from ..detection.at_rest.body_parts import connect_cells
 from ..detection.mesh import CollisionMesh
 from ..mesh_files.check import find_meeting
-from ..mesh_files.file_scene import FileScene
+from ..mesh_files.file_scene import FileScene, FrameMesh
 from ..mesh_files.frames import Frames, make_folder
 from ..mesh_files.mesh_file import MeshFile, MeshScene, is_mesh_file
 from ..repairing.repair import repair
 from ..repairing.results import RepairResult
 from ..repairing.shot.findings import kept_meshes
+from ..repairing.shot.mesh_groups import bits_of
 from ..repairing.shot.report import write_page
 from ..repairing.shot.stretch import ShotFrame, StretchRecorder
 from ..usd.selection import Selection
@@ -61,10 +60,17 @@ def repair_files(frames: Frames, arguments: argparse.Namespace, selection: Selec
         raise ValueError("--previous: the files must have the faces of the scene")
     kept = np.array([output is None for output in outputs])
     are_rigid = np.array(frames.matching(arguments.rigid, "--rigid"))
-    meets = ~(kept & kept[:, None])
-    named: list[Any] = [SimpleNamespace(path=name, name=name) for name in frames.names]
-    meets.flat[selection.ignored_pairs(named, np.argwhere(meets | True))] = False
-    mesh = _mesh_of(scene, meets, device)
+    named = [FrameMesh(name, {}, False) for name in frames.names]
+    pairs = np.indices((len(named), len(named))).reshape(2, -1).T
+    ignored = [(frames.names[a], frames.names[b]) for a, b in pairs[selection.ignored_pairs(named, pairs)].tolist()]
+    bits = bits_of(frames.names, set(itertools.compress(frames.names, kept)), ignored)
+    of_files = np.array([bits[name] for name in frames.names], dtype=np.uint32)
+
+    def mesh_of(scene: MeshScene) -> CollisionMesh:
+        group, mask = of_files[scene.file_of].T
+        return CollisionMesh(scene.faces, len(scene.x), group=group, mask=mask, device=device)
+
+    mesh = mesh_of(scene)
     pieces = connect_cells(mesh.edges, len(scene.x))
     make_folder(arguments.output)
     with contextlib.ExitStack() as stack:
@@ -100,8 +106,7 @@ def repair_files(frames: Frames, arguments: argparse.Namespace, selection: Selec
     with np.errstate(over="ignore"):
         rounded = written.x.astype(np.float32)
     positions = [written.x, rounded] if np.isfinite(rounded).all() else [written.x]
-    again = _mesh_of(written, meets, device)
-    meeting = [len(find_meeting(again, x)[1].pairs) for x in positions]
+    meeting = [len(find_meeting(mesh_of(written), x)[1].pairs) for x in positions]
     among_kept = CollisionMesh(scene.faces[kept[scene.file_of[scene.faces[:, 0]]]], len(scene.x), device=device)
     found, remaining = {"intersections": result.crossings_before}, {"intersections": meeting[0]}
     if arguments.min_distance:
@@ -190,13 +195,3 @@ def in_words(elements: list[dict[str, Any]]) -> str:
     numbers = [(next(iter(element)), element["of"], next(iter(element.values()))) for element in elements]
     place = " ".join(f"{coordinate:.4g}" for coordinate in elements[0]["at"])
     return ", ".join(f"{kind} {number} of {path}" for kind, path, number in numbers) + f", at {place}"
-
-
-def _mesh_of(scene: MeshScene, meets: np.ndarray, device: wp.Device) -> CollisionMesh:
-    """Returns the mesh of a scene, given which files may meet which, bool; those that may meet the same are a group."""
-    _, first, number = np.unique(meets, axis=0, return_index=True, return_inverse=True)
-    if len(first) > 32:
-        raise ValueError(f"--triage makes {len(first)} combinations of files that may meet; at most 32 are possible")
-    bits = np.uint32(1) << np.arange(len(first), dtype=np.uint32)
-    of_vertex, masks = number.reshape(-1)[scene.file_of], (meets[first][:, first] * bits).sum(axis=1, dtype=np.uint32)
-    return CollisionMesh(scene.faces, len(scene.x), group=bits[of_vertex], mask=masks[of_vertex], device=device)

@@ -83,8 +83,7 @@ def add_replay_options(command: argparse.ArgumentParser) -> None:
     command.add_argument("scene", metavar="SCENE", nargs="?", help=text)
 
     which = command.add_argument_group("selection")
-    add_scene_selection(which)
-    add_options(which, _SELECTION)
+    add_options(which, {**SCENE, **_SELECTION})
     out = command.add_argument_group("output")
     add_options(out, _OUTPUT)
     add_fail_on(
@@ -102,13 +101,8 @@ def add_replay_options(command: argparse.ArgumentParser) -> None:
     add_options(command, detection_options("exact"))
 
 
-def add_scene_selection(which: argparse._ArgumentGroup) -> None:
-    """Adds the options that select meshes, pairs of them and the time of a scene, and how it is read."""
-    add_options(which, _SCENE)
-
-
 def read_selection(arguments: argparse.Namespace, *, of_files: bool = False) -> Selection:
-    """Returns the selection that the options of :func:`add_scene_selection` make, of a scene or of mesh files.
+    """Returns the selection that the options of :data:`SCENE` make, of a scene or of mesh files.
 
     Raises:
         OSError: If the file of ``--triage`` cannot be read.
@@ -128,7 +122,7 @@ def read_selection(arguments: argparse.Namespace, *, of_files: bool = False) -> 
 def read_scene(
     path: str, arguments: argparse.Namespace, *, written: Sequence[str] = (), as_json: bool = False, **options: Any
 ) -> Scene:
-    """Opens a scene with the options of :func:`add_scene_selection` that say how it is read, and shows the progress.
+    """Opens a scene with the options of :data:`SCENE` that say how it is read, and shows the progress.
 
     The files of ``written`` are to be written; with ``as_json`` the progress is for programs.
 
@@ -161,7 +155,7 @@ def read_scene(
 
 
 def describe_selection(scene: Scene, arguments: argparse.Namespace) -> dict[str, Any]:
-    """Returns the options of :func:`add_scene_selection` that results depend on, and the scene's selection, as JSON."""
+    """Returns the options of :data:`SCENE` that results depend on, and the scene's selection, as JSON."""
     selection = asdict(scene.selection)
     del selection["ignored_names"], selection["ignored_inside"]  # found, not chosen
     frames = asdict(arguments.frames) if arguments.frames else None
@@ -189,7 +183,7 @@ def repair_command_of(scene: Scene, arguments: argparse.Namespace) -> str:
 
 
 def _selection_words(arguments: argparse.Namespace) -> list[str]:
-    """Returns the options of :func:`add_scene_selection` as words of a command."""
+    """Returns the options of :data:`SCENE` as words of a command."""
     words = ["--no-self"] * (not arguments.self_collisions) + ["--strict"] * arguments.strict
     if frames := arguments.frames:
         numbers = [frames.start, frames.end] + [frames.step] * (frames.step is not None)
@@ -237,7 +231,7 @@ def _workers(text: str) -> int | str:
         raise argparse.ArgumentTypeError(message) from error
 
 
-_SCENE: Options = {
+SCENE: Options = {
     "--prims": patterns(
         "check only meshes at or below these prims or instances, named as in the report; * matches any text"
     ),
@@ -276,6 +270,7 @@ _SCENE: Options = {
         "may always be missing"
     ),
 }
+"""The options that select meshes, pairs of them and the time of a scene, and how it is read."""
 _SELECTION: Options = {
     "--intersections": switch(
         "find the edges that pass through faces or touch them at the time samples themselves, and the meshes that "

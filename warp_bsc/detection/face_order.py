@@ -13,9 +13,6 @@ CLUSTER = WIDTH
 BUNDLE = WIDTH * CLUSTER
 """Places of a bundle."""
 
-_CLUSTER = wp.constant(CLUSTER)
-_BUNDLE = wp.constant(BUNDLE)
-
 _LARGE = wp.constant(4096)
 """Faces of a part that is split along the best of four axes instead of eight, which takes less time."""
 
@@ -24,7 +21,6 @@ _STAMPS = 16
 
 _MIN_OWN_CLUSTER = 8
 """Connected components with fewer faces share clusters, so that at most three of four places are empty."""
-
 
 _AXES = wp.constant(wp.types.matrix(shape=(8, 2), dtype=int)(1, 0, 0, 1, 1, 1, 1, -1, 2, 1, 2, -1, 1, 2, 1, -2))
 """Directions in the plane of both coordinates, from pole to pole, along which parts may be split."""
@@ -84,12 +80,12 @@ def _split_at(begin: int, end: int):
     """Returns where to split a part near the middle: between bundles or else between clusters."""
     middle = (begin + end) / 2
     quarter = (end - begin) / 4
-    split = (middle + _BUNDLE / 2) / _BUNDLE * _BUNDLE
+    split = (middle + BUNDLE / 2) / BUNDLE * BUNDLE
     if split > begin + quarter and split < end - quarter:
         return split
-    split = (middle + _CLUSTER / 2) / _CLUSTER * _CLUSTER
+    split = (middle + CLUSTER / 2) / CLUSTER * CLUSTER
     if split >= end:
-        split -= _CLUSTER
+        split -= CLUSTER
     return split
 
 

@@ -20,7 +20,7 @@ from ..response.options import Inversions, Reported
 from ..response.solver_ccd import SolverCCD
 from ..response.state.collision_filter import CollisionFilter
 from ..response.state.friction_table import FrictionTable
-from ..response.state.mesh import host_array
+from ..response.state.mesh import dynamic_bodies, host_array
 from ..response.state.motion import arrays_of
 from ..response.state.status import Loop
 from ..response.state.structs import Bodies
@@ -38,14 +38,6 @@ MAX_STEPS, MAX_PRECISE_STEPS = 15, 100
 are within 0.4 mm of where many more lead, in the mean of their particles, but for the chaotic pile of cubes."""
 
 
-def _dynamic_bodies(model: newton.Model) -> np.ndarray:
-    """Returns which bodies are neither kinematic nor without mass, shape [body_count]."""
-    if not model.body_count:
-        return np.zeros(0, dtype=bool)
-    is_kinematic = (host_array(model.body_flags) & BodyFlags.KINEMATIC) != 0
-    return (host_array(model.body_inv_mass) > 0.0) & ~is_kinematic
-
-
 def _find_jointed_body(model: newton.Model) -> int | None:
     """Returns a dynamic body that a joint holds, None if there is none. Joints of proxies are of another solver."""
     if not model.joint_count:
@@ -54,7 +46,7 @@ def _find_jointed_body(model: newton.Model) -> int | None:
     ends = np.concatenate([host_array(model.joint_child)[holds], host_array(model.joint_parent)[holds]])
     ends = ends[ends >= 0]
     is_proxy = (host_array(model.body_flags) & BodyFlags.PROXY) != 0
-    jointed = ends[(_dynamic_bodies(model) & ~is_proxy)[ends]]
+    jointed = ends[(dynamic_bodies(model) & ~is_proxy)[ends]]
     return int(jointed[0]) if len(jointed) else None
 
 
@@ -206,7 +198,7 @@ class SolverImplicit(SolverCCD):
             )
         attached = attachment_arrays(model) if moves else None
         if attached is not None:
-            if _dynamic_bodies(model)[host_array(attached.body)].any():
+            if dynamic_bodies(model)[host_array(attached.body)].any():
                 raise NotImplementedError(
                     "model: it attaches particles to a body that SolverImplicit would move; make the body kinematic, "
                     "or pass bodies='ignored' if something else writes its pose"
@@ -216,7 +208,7 @@ class SolverImplicit(SolverCCD):
         max_steps = checked_integer(max_iterations, "max_iterations", 1)
         super().__init__(
             _Inertia(model, moves_bodies=moves),
-            bodies="separated" if moves and _dynamic_bodies(model).any() else "ignored",
+            bodies="separated" if moves and dynamic_bodies(model).any() else "ignored",
             restitution=0.0,
             friction=friction,
             min_distance=min_distance,

@@ -8,31 +8,25 @@ mat34 = wp.types.matrix(shape=(3, 4), dtype=wp.float32)
 """Rows of a 3 x 3 block, each with a fourth number without meaning."""
 
 
-@wp.func_native(
-    snippet="""
+def _reading(scalar: str) -> str:
+    """Returns the native code that reads four numbers of a type."""
+    return f"""
 #if defined(__CUDA_ARCH__)
-    const int4 v = *(const int4*)(values.data + i);
-    return wp::vec_t<4, int>(v.x, v.y, v.z, v.w);
+    const {scalar}4 v = *(const {scalar}4*)(values.data + i);
+    return wp::vec_t<4, {scalar}>(v.x, v.y, v.z, v.w);
 #else
     return values.data[i];
 #endif
 """
-)
+
+
+@wp.func_native(snippet=_reading("int"))
 def integers_at(values: wp.array[wp.vec4i], i: int) -> wp.vec4i:
     """Returns four integers, such as the corners of a pair."""
     ...
 
 
-@wp.func_native(
-    snippet="""
-#if defined(__CUDA_ARCH__)
-    const float4 v = *(const float4*)(values.data + i);
-    return wp::vec_t<4, float>(v.x, v.y, v.z, v.w);
-#else
-    return values.data[i];
-#endif
-"""
-)
+@wp.func_native(snippet=_reading("float"))
 def numbers_at(values: wp.array[wp.vec4], i: int) -> wp.vec4:
     """Returns four numbers, such as the weights of corners."""
     ...

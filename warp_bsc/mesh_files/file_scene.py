@@ -166,7 +166,7 @@ class _Files(SceneFiles):
 class FrameMesh:
     """The files of one name, as a segment reads a mesh."""
 
-    display_name, instanced_prim = "", ""
+    instanced_prim = ""
     is_strands = is_rigid = may_jump = has_tetrahedra = False
     why_not_written = None
 
@@ -203,10 +203,10 @@ class FrameMesh:
         """Returns the positions at a frame, shape [point_count, 3]."""
         return self.read(time).x
 
-    def read_triangles(self, time: float, _points: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
-        """Returns the triangles, the polygon of each, and the number of polygons."""
+    def read_triangles(self, time: float, _points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the triangles, and the polygon of each."""
         mesh = self.read(time)
-        return mesh.faces, mesh.polygons, int(mesh.polygons[-1]) + 1
+        return mesh.faces, mesh.polygons
 
     def read_positions(
         self, time: float, *, before: bool, used: np.ndarray, point_count: int, dtype: np.dtype

@@ -2,12 +2,10 @@
 
 import warp as wp
 
+from ..kernels.signs import HALF, ONE, TWO, ZERO
+
 wp.set_module_options({"enable_backward": False})
 
-_ZERO = wp.constant(wp.float64(0.0))
-_HALF = wp.constant(wp.float64(0.5))
-_ONE = wp.constant(wp.float64(1.0))
-_TWO = wp.constant(wp.float64(2.0))
 _TINY = wp.constant(wp.float64(1.0e-300))
 _FLATTEST = wp.constant(wp.float64(0.05))
 """Sine of the smallest angle between an edge and a face with which a gradient is computed."""
@@ -64,24 +62,24 @@ def contour_gradients(
     normal = _direction(n)
     e = _direction(q - p)
     from_p = wp.dot(p - a, normal)
-    s = wp.clamp(from_p / wp.where(from_p == wp.dot(q - a, normal), _ONE, from_p - wp.dot(q - a, normal)), _ZERO, _ONE)
+    s = wp.clamp(from_p / wp.where(from_p == wp.dot(q - a, normal), ONE, from_p - wp.dot(q - a, normal)), ZERO, ONE)
     w = p + s * (q - p) - a
     nn = wp.max(wp.dot(n, n), _TINY)
-    beta = wp.clamp(wp.dot(wp.cross(w, v), n) / nn, _ZERO, _ONE)
-    gamma = wp.clamp(wp.dot(wp.cross(u, w), n) / nn, _ZERO, _ONE - beta)
+    beta = wp.clamp(wp.dot(wp.cross(w, v), n) / nn, ZERO, ONE)
+    gamma = wp.clamp(wp.dot(wp.cross(u, w), n) / nn, ZERO, ONE - beta)
     along[i] = s
-    coordinates[i] = wp.vec3d(_ONE - beta - gamma, beta, gamma)
+    coordinates[i] = wp.vec3d(ONE - beta - gamma, beta, gamma)
     steep = wp.dot(e, normal)
-    steep = wp.where(steep < _ZERO, wp.min(steep, -_FLATTEST), wp.max(steep, _FLATTEST))
+    steep = wp.where(steep < ZERO, wp.min(steep, -_FLATTEST), wp.max(steep, _FLATTEST))
     total = wp.vec3d()
     for k in range(starts[i], starts[i + 1]):
         inward = x[opposite[k]] - p
         inward -= wp.dot(inward, e) * e
         r = _direction(wp.cross(normal, wp.cross(e, inward)))
-        if wp.dot(r, inward) < _ZERO:
+        if wp.dot(r, inward) < ZERO:
             r = -r
-        total += r - _TWO * wp.dot(e, r) / steep * normal
-    gradient[i] = total / wp.max(wp.length(total), _ONE)
+        total += r - TWO * wp.dot(e, r) / steep * normal
+    gradient[i] = total / wp.max(wp.length(total), ONE)
 
 
 @wp.struct
@@ -131,7 +129,7 @@ def _move(planes: Planes, place: int, short: wp.float64) -> wp.vec3d:
 def _push(i: int, x: wp.array[wp.vec3d], planes: Planes):
     """Returns the mean move of a vertex that puts its contacts at their distances, shared with the other corners."""
     total = wp.vec3d()
-    count = _ZERO
+    count = ZERO
     first = int(0)
     last = int(0)
     if planes.starts:
@@ -139,10 +137,10 @@ def _push(i: int, x: wp.array[wp.vec3d], planes: Planes):
         last = planes.starts[i + 1]
     for k in range(first, last):
         short = _shortfall(x, planes, planes.places[k] / 4)
-        if short > _ZERO:
+        if short > ZERO:
             total += _move(planes, planes.places[k], short)
-            count += _ONE
-    return total / wp.max(count, _ONE)
+            count += ONE
+    return total / wp.max(count, ONE)
 
 
 @wp.kernel
@@ -170,13 +168,13 @@ def move_apart(
     """Moves vertices by the mean of the moves that put their contacts at their distances."""
     i = wp.tid()
     total = wp.vec3d()
-    count = _ZERO
+    count = ZERO
     for k in range(planes.starts[i], planes.starts[i + 1]):
         short = shortfalls[planes.places[k] / 4]
-        if short > _ZERO:
+        if short > ZERO:
             total += _move(planes, planes.places[k], short)
-            count += _ONE
-    x[vertices[i]] += total / wp.max(count, _ONE)
+            count += ONE
+    x[vertices[i]] += total / wp.max(count, ONE)
 
 
 @wp.kernel
@@ -209,15 +207,15 @@ def relax_springs(
     vertex = vertices[i]
     p = x[vertex]
     total = wp.vec3d()
-    weight = _ZERO
+    weight = ZERO
     for k in range(starts[i], starts[i + 1]):
         along = x[ends[k]] - p
         length = wp.length(along)
-        wanted = wp.clamp(length, lengths[k] * (_ONE - slack), lengths[k] * (_ONE + slack))
+        wanted = wp.clamp(length, lengths[k] * (ONE - slack), lengths[k] * (ONE + slack))
         total += weights[k] * (length - wanted) * _direction(along)
         weight += weights[k]
     last = p - relaxed[vertex]
-    relaxed[vertex] = p + _HALF * total / wp.max(weight, _TINY) + _push(i, x, planes) + momentum * last
+    relaxed[vertex] = p + HALF * total / wp.max(weight, _TINY) + _push(i, x, planes) + momentum * last
 
 
 @wp.kernel

@@ -9,7 +9,6 @@ from typing import Any, Literal, get_args
 import newton
 import numpy as np
 import warp as wp
-from newton import BodyFlags
 from newton.solvers import SolverBase, SolverSemiImplicit, SolverVBD, SolverXPBD
 
 from .._arguments import (
@@ -23,7 +22,7 @@ from .._arguments import (
 from .._private_names.of_newton import has_external_rigid_solver
 from .state.friction import Friction
 from .state.friction_table import FrictionTable, checked_table
-from .state.mesh import ModelMesh
+from .state.mesh import ModelMesh, dynamic_bodies
 from .tuning import CONTACTS_PER_PARTICLE, MIN_CONTACTS, SEPARATION
 
 MAX_SUBSTEPS, MAX_CONTACTS = 1024, 2**28
@@ -43,9 +42,7 @@ def moves_bodies(bodies: Bodies, mesh: ModelMesh, solver: SolverBase) -> bool:
         if not integrates or has_external_rigid_solver(solver):
             return False
     shaped = np.unique(mesh.shape_vertices.body[mesh.shape_vertices.body >= 0])
-    assert model.body_flags is not None and model.body_inv_mass is not None
-    kinematic = (model.body_flags.numpy() & BodyFlags.KINEMATIC) != 0
-    return bool(((model.body_inv_mass.numpy() > 0.0) & ~kinematic)[shaped].any())
+    return bool(dynamic_bodies(model)[shaped].any())
 
 
 def default_separation(mesh: ModelMesh) -> float:
@@ -54,7 +51,7 @@ def default_separation(mesh: ModelMesh) -> float:
     It has eight bits: copies of a mesh that are turned have other lengths in the last bits, and each world of a model
     moves as it would alone.
     """
-    lengths = particle_edge_lengths(mesh)
+    lengths = mesh.particle_edge_lengths()
     if not lengths.any():
         return SEPARATION
     return in_eight_bits(SEPARATION * np.median(lengths))
@@ -64,19 +61,6 @@ def in_eight_bits(x: float) -> float:
     """Returns a number rounded to eight bits."""
     fraction, exponent = np.frexp(x)
     return float(np.ldexp(np.round(fraction * 256.0), exponent - 8))
-
-
-def particle_edge_lengths(mesh: ModelMesh) -> np.ndarray:
-    """Returns the lengths of the edges of cloth, soft bodies and ropes at rest [m], shape [n]."""
-    particle_q = mesh.model.particle_q
-    rest = np.zeros((0, 3)) if particle_q is None else particle_q.numpy()
-    edges = mesh.edges[mesh.edges[:, 1] < mesh.model.particle_count]
-    return np.linalg.norm(rest[edges[:, 1]] - rest[edges[:, 0]], axis=1)
-
-
-def checked_bodies(bodies: str) -> Bodies:
-    """Returns the argument ``bodies``."""
-    return checked_choice(bodies, "bodies", get_args(Bodies))
 
 
 def checked_separation(separation: float | None) -> float | None:

@@ -19,7 +19,6 @@ from .options import (
     Bodies,
     Inversions,
     Reported,
-    checked_bodies,
     checked_friction,
     checked_report,
     checked_restitution,
@@ -181,7 +180,7 @@ class SolverCCD(CollisionStage):
             NotImplementedError: If the model has shapes that are not supported, see :class:`.state.mesh.ModelMesh`.
         """
         super().__init__(solver)
-        separation, bodies = checked_separation(separation), checked_bodies(bodies)
+        separation, bodies = checked_separation(separation), checked_choice(bodies, "bodies", get_args(Bodies))
         self.friction, table, self._reads_friction = checked_friction(friction, self.model)
         self.restitution = checked_restitution(restitution, self.model)
         self.substeps = checked_integer(substeps, "substeps", 1, MAX_SUBSTEPS)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ..detection.arcs.rigid_motion import RigidMotion, points_on_arcs
+from ..detection.arcs.rigid_motion import RigidMotion
 from ..usd.interval import Interval
 
 _TOLERANCE = 2.0**-16
@@ -47,24 +47,3 @@ def arcs_of(interval: Interval) -> RigidMotion | None:
     if lever == 0.0:
         return None
     return RigidMotion(body, centre, vector, tolerance=max(_TOLERANCE * float(lever), 2.0**-40 * size))
-
-
-def positions_at(
-    x0: np.ndarray, x1: np.ndarray, arcs: RigidMotion | None, vertices: np.ndarray, time: np.ndarray
-) -> np.ndarray:
-    """Returns positions of vertices at times of a motion, 0 at its start and 1 at its end, float64.
-
-    Args:
-        x0: Positions at the start, shape [vertex_count, 3].
-        x1: Positions at the end.
-        arcs: The motion of vertices on arcs; None if all move straight.
-        vertices: Vertices, shape [n, k].
-        time: Their times, shape [n].
-
-    Returns:
-        Positions, shape [n, k, 3].
-    """
-    if arcs is not None:
-        return points_on_arcs(arcs, x0, x1, vertices, time[:, None])
-    time = time[:, None, None]
-    return (1.0 - time) * x0[vertices].astype(np.float64) + time * x1[vertices].astype(np.float64)

@@ -9,13 +9,12 @@ from typing import ClassVar
 import numpy as np
 
 from .._sorted_keys import KeySet
-from ..detection.arcs.rigid_motion import RigidMotion
+from ..detection.arcs.rigid_motion import RigidMotion, points_on_arcs
 from ..detection.detector import Collisions
 from ..detection.mesh import CollisionMesh
 from ..detection.run.settings import PairKind
 from ..usd.interval import Interval, positions_of
 from ..usd.selection import Selection
-from .scene_arcs import positions_at
 from .scene_intersections import SceneIntersections, pair_keys, tangled_vertices
 from .scene_pairs import NO_PAIRS, VERTEX, ScenePairs, are_stiff, count_by_meshes, name_elements, split_rows, take_rows
 
@@ -105,7 +104,10 @@ def find_contacts(
     x0, x1 = positions_of(intervals)
 
     def at_impact(corners: np.ndarray, times: np.ndarray) -> np.ndarray:
-        return positions_at(x0, x1, arcs, corners, times)
+        if arcs is not None:
+            return points_on_arcs(arcs, x0, x1, corners, times[:, None])
+        times = times[:, None, None]
+        return (1.0 - times) * x0[corners].astype(np.float64) + times * x1[corners].astype(np.float64)
 
     on_edge = np.concatenate([collisions.edge_edge_coordinates[apart, :1], collisions.vertex_edge_coordinates[:, :1]])
     edges = np.concatenate([at_impact(ends[:, 0], tois[1]), at_impact(point_ends, tois[2])])

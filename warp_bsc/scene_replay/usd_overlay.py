@@ -10,7 +10,7 @@ import numpy as np
 from .._version import __version__
 from ..usd.scene import Scene
 from ..usd.segment import Segment
-from ..usd.write.layer import SceneLayer, just_before, unused_path
+from ..usd.write.layer import SceneLayer, just_before
 from ..usd.write.layer_writer import LayerPrim, LayerScope, PrimKind, define_prims
 from .limit import not_listed
 from .outputs import ReplayOutput
@@ -146,7 +146,9 @@ class Overlay(ReplayOutput):
         self._last: IntervalResult | None = None  # the last complete interval
         self._prims: dict[str, int] = {}  # number of each mesh with a pair, by its name
         self._pairs: dict[frozenset[str], LayerScope] = {}  # prims of pairs of meshes, by the names of the two
-        self._root_path = unused_path(scene, "/Collisions")
+        self._root_path = "/Collisions"
+        while scene.stage.GetPrimAtPath(self._root_path):
+            self._root_path += "_"
         low, high = _bounds(scene)
         self._size = float(np.linalg.norm(high - low)) or 1.0
         super().__init__(path)

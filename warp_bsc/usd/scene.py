@@ -36,7 +36,7 @@ from .interval import Interval, LeftOutMesh, ReadingNotes, ReadingRecord
 from .jumps import JumpFinder, jumps_at
 from .read.files import SceneFiles
 from .read.openusd import check_openusd
-from .scene_options import EmptySceneError, Revealed, SceneOptions
+from .scene_options import EmptySceneError, SceneOptions
 from .scene_times import find_times
 from .segment import Segment
 from .selection import Selection
@@ -143,17 +143,19 @@ class Scene:
         options = SceneOptions.of(selection, frames, subdivide, sample_turns, strict, allow_missing)
         if progress is not None and not callable(progress):
             raise TypeError(f"progress must be a function, not {given(progress)}")
-        self._open(path, options, Revealed(), progress, stage)
+        self._open(path, options, progress=progress, stage=stage)
 
     def _open(
         self,
         path: str | os.PathLike,
         options: SceneOptions,
-        revealed: Revealed,
+        left_out: Iterable[LeftOutMesh] = (),
+        welds: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] | None = None,
+        *,
         progress: Callable[[int, int], None] | None = None,
         stage: "Usd.Stage | None" = None,
     ) -> None:
-        """Opens the file or takes a stage, and finds its meshes, given what reading has revealed in another process."""
+        """Opens the file or takes a stage, and finds its meshes; left-out ones and welds are of another process."""
         from pxr import UsdGeom  # noqa: PLC0415 (slow)
 
         from .read.find_meshes import find_meshes  # noqa: PLC0415 (imports pxr)
@@ -200,10 +202,10 @@ class Scene:
             self._span: tuple[int, int] | None = None
             self._jumps = JumpFinder()
             self._welds = {}  # by span
-            for part in revealed.left_out:
+            for part in left_out:
                 self.left_out.append(part.reason)
                 self._apply(part)
-            self._welds.update(revealed.welds)
+            self._welds.update(welds or {})
             segment = self.segment(0, progress)
         self.vertex_count, self.face_count = segment.vertex_count, len(segment.faces)
         read = [mesh for mesh in self._usd_meshes if any(mesh.states.values())]
@@ -238,7 +240,7 @@ class Scene:
 
     def __reduce__(self):
         """Returns the call that opens the scene again."""
-        revealed = Revealed(tuple(self._record.parts), self._welds)
+        revealed = tuple(self._record.parts), self._welds
         if self._is_given:
             from .read.stage import write_for_others  # noqa: PLC0415 (imports pxr)
 
@@ -430,7 +432,7 @@ def _open_again(path, options, revealed, versions, contents) -> Scene:
     """Opens a scene that another process has opened; a ValueError if the file or the scene differs here."""
     check_openusd()
     scene = Scene.__new__(Scene)
-    scene._open(path, options, revealed)
+    scene._open(path, options, *revealed)
     if changed := scene.files.differing(versions):
         raise ValueError(f"{changed}: not the version of the file that the replay was started with")
     if scene._contents()[: len(contents)] != contents:

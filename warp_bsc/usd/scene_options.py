@@ -1,12 +1,9 @@
-"""The options of a scene and the results of reading it with which another process opens it again."""
+"""The options of a scene, with which another process opens it again."""
 
-from dataclasses import dataclass, field
-
-import numpy as np
+from dataclasses import dataclass
 
 from .._arguments import check_instance, checked_flag, checked_integer, checked_strings
 from .frames import FrameRange
-from .interval import LeftOutMesh
 from .selection import Selection
 
 _MOST_PARTS = 10_000  # of a step between two times
@@ -42,11 +39,3 @@ class SceneOptions:
             checked_flag(strict, "strict"),
             checked_strings(allow_missing, "allow_missing"),
         )
-
-
-@dataclass(frozen=True)
-class Revealed:
-    """The meshes left out while reading a scene, and the welds of its segments by their span of intervals."""
-
-    left_out: tuple[LeftOutMesh, ...] = ()
-    welds: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)

@@ -67,7 +67,7 @@ class Segment:
         compact = {}  # by identity of the triangles, which instances share: used points, corners, and the triangles
         for mesh in usd_meshes:
             points = mesh.read_points(times[0])
-            triangles, polygons, polygon_count = mesh.read_triangles(times[0], points)
+            triangles, polygons = mesh.read_triangles(times[0], points)
             if mesh.is_strands:
                 used, corners = np.arange(len(points)), triangles
                 own_edges, own_curves, own_radius = mesh.read_strands(times, len(points))
@@ -88,7 +88,6 @@ class Segment:
                 SceneMesh(
                     path=mesh.path,
                     name=mesh.name,
-                    display_name=mesh.display_name,
                     moves=bool(mesh.times),
                     deforms=mesh.deforms,
                     vertices=slice(vertex_count, vertex_count + len(used)),
@@ -96,7 +95,6 @@ class Segment:
                     points=used,
                     point_count=len(points),
                     polygons=polygons,
-                    polygon_count=polygon_count,
                 )
             )
             vertex_count += len(used)

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-_FIRST = 0.382
-"""Where between the two times a transform is first tested for a turn; halfway, two whole turns look like none."""
+BETWEEN = 0.382
+"""Where between two times a transform is first tested for a bend; halfway, two whole turns look like none."""
 _COUNTED = [2.0**-10, 2.0**-5, 1.0]
 """Where turns are counted: at the first a turn must be less than a half, 512 turns in all, so that its direction is
 known; each angle tells the next up to rounding, and so how many whole turns that has."""
@@ -66,28 +66,28 @@ def find_turns(transforms: Callable[[int, float], np.ndarray | None], numbers: l
         found = [transforms(number, share) for number in numbers]
         return np.array([np.full((4, 4), np.nan) if matrix is None else matrix for matrix in found]).reshape(-1, 4, 4)
 
-    ends = [read(share, numbers) for share in (0.0, 1.0, _FIRST)]
-    bent = ~_are_straight(*ends) & np.isfinite(np.stack(ends)).all(axis=(0, 2, 3))
+    ends = [read(share, numbers) for share in (0.0, 1.0, BETWEEN)]
+    bent = are_bent(*ends) & np.isfinite(np.stack(ends)).all(axis=(0, 2, 3))
     invertible = np.where(bent[:, None, None], ends[0][:, :3, :3], np.eye(3))
     bent = bent & (np.linalg.cond(invertible) < _LARGEST_CONDITION)
     some = [number for number, is_bent in zip(numbers, bent.tolist(), strict=True) if is_bent]
     if not some:
         return {}
-    shares = [0.0, 1.0, _FIRST, *_COUNTED[:-1], *_OTHERS]
+    shares = [0.0, 1.0, BETWEEN, *_COUNTED[:-1], *_OTHERS]
     matrices = [end[bent] for end in ends] + [read(share, some) for share in shares[len(ends) :]]
     centres, vectors, fit = _fit_turns(np.array(shares), np.stack(matrices, axis=1))
     rows = zip(some, centres, vectors, fit.tolist(), strict=True)
     return {number: Turn(centre, vector) for number, centre, vector, fits in rows if fits}
 
 
-def _are_straight(start: np.ndarray, end: np.ndarray, between: np.ndarray) -> np.ndarray:
-    """Returns which transforms between two others move points on the straight paths from one to the other, bool."""
-    off = np.abs(between - start - _FIRST * (end - start))
+def are_bent(start: np.ndarray, end: np.ndarray, between: np.ndarray) -> np.ndarray:
+    """Returns which transforms, at :data:`BETWEEN` of two others, move points off the straight paths, bool."""
+    off = np.abs(between - start - BETWEEN * (end - start))
     size = np.maximum(np.abs(start), np.abs(end))
     parts = [
-        off[:, rows].max(axis=(1, 2)) <= _SINGLE * size[:, rows].max(axis=(1, 2)) for rows in (slice(3), slice(3, 4))
+        off[:, rows].max(axis=(1, 2)) > _SINGLE * size[:, rows].max(axis=(1, 2)) for rows in (slice(3), slice(3, 4))
     ]
-    return parts[0] & parts[1]
+    return parts[0] | parts[1]
 
 
 def _fit_turns(shares: np.ndarray, matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

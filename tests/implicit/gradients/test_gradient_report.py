@@ -35,7 +35,7 @@ def test_growth_names_step_and_particle(device):
 def test_what_is_lost_counts_once(device):
     """Not in a world without gradients, and not again where it was NaN before."""
     report = report_of(wp.get_device(device), before=[1.0, 0.0], after=[1.0, 0.0], failed=(1, 1))
-    report.ambiguous_moves.fill_(3)
+    report.counts[kernels.Count.AMBIGUOUS_MOVES : kernels.Count.AMBIGUOUS_MOVES + 1].fill_(3)
     assert report.totals() == GradientCounts(
         steps=1, unsolved=1, failed_solves=0, growing=0, ambiguous_moves=3, unrepeated=0
     )

@@ -149,7 +149,8 @@ def test_jacobians_of_contacts_are_those_of_adjoints(name, device):
     vertices = array(np.arange(4 * count).reshape(-1, 4), int)
 
     def jacobians(kernel):
-        elements = Elements(contact_forces, vertices, vertices, parameters, jacobians=kernel)
+        elements = Elements(contact_forces, vertices, vertices, jacobians=kernel)
+        elements.parameters = parameters
         elements.load(array(x1.reshape(-1, 3), wp.vec3d), array(x0.reshape(-1, 3), wp.vec3d))
         elements.differentiate(DT)
         return elements.jacobian.numpy()

@@ -23,12 +23,8 @@ SOLVERS = ("SolverVBD", "SolverXPBD", "SolverStyle3D", "SolverSemiImplicit")
 """The solvers of Newton that move cloth and soft bodies."""
 
 
-class _NotApplicable(Exception):
-    """The example cannot be measured in this mode; the message says why."""
-
-
-class _NeedsDownload(Exception):
-    """The example needs an asset that may not be downloaded; the message names it."""
+class _NotMeasured(Exception):
+    """The example cannot be measured, such as in this mode or without a download; the message says why."""
 
 
 def _describe_error(error: BaseException) -> str:
@@ -46,10 +42,8 @@ def serve(request: dict[str, Any], reply: Callable[[dict[str, Any]], None]) -> N
     """Serves a request of :func:`measure_example` in this process, which must not serve another one."""
     try:
         measured = _measure_here(request, lambda frame, frames: reply({"frame": frame, "frames": frames}))
-    except _NotApplicable as reason:
-        reply({"problem": f"not applicable: {reason}"})
-    except _NeedsDownload as reason:
-        reply({"problem": describe_download(str(reason))})
+    except _NotMeasured as reason:
+        reply({"problem": str(reason)})
     except Exception as error:
         missing = error if isinstance(error, ModuleNotFoundError) else error.__cause__
         if isinstance(missing, ModuleNotFoundError):  # Newton raises an error of its own from that for a backend
@@ -79,7 +73,7 @@ def _measure_here(request: dict[str, Any], progress: Callable[[int, int], None])
             frames = arguments.num_frames if own else FRAMES
             frames = min(frames, CPU_FRAMES) if wp.get_device().is_cpu else frames
         if replaced and not stages:
-            raise _NotApplicable(f"no solver with particles is one of {', '.join(replaced)}")
+            raise _NotMeasured(f"not applicable: no solver with particles is one of {', '.join(replaced)}")
         measurements.append(_measure_frames(example, frames, request["check_every"], stages, progress))
 
     replace_name(newton.examples, "run", run)
@@ -93,13 +87,14 @@ def _measure_here(request: dict[str, Any], progress: Callable[[int, int], None])
     sys.argv = [request["module"], *options]
     runpy.run_module(request["module"], run_name="__main__")
     if not measurements:
-        raise _NotApplicable("it does not call newton.examples.run")
+        raise _NotMeasured("not applicable: it does not call newton.examples.run")
     return measurements[0]
 
 
 def _refuse_download(*arguments, **options):
     """Stands in for the functions of Newton that download."""
-    raise _NeedsDownload(next((str(argument) for argument in (*arguments, *options.values())), ""))
+    asset = next((str(argument) for argument in (*arguments, *options.values())), "")
+    raise _NotMeasured(describe_download(asset))
 
 
 class _StagedType(type):
@@ -254,14 +249,14 @@ def _name_of_state(example: Any) -> str:
     """Returns the name of the attribute that has an example's present state, which the example may replace by another.
 
     Raises:
-        _NotApplicable: If the example has no cloth and no soft bodies, or its state is not where Newton's examples have
+        _NotMeasured: If the example has no cloth and no soft bodies, or its state is not where Newton's examples have
             theirs.
     """
     model, name = getattr(example, "model", None), next((n for n in ("state_0", "state") if hasattr(example, n)), "")
     if model is None or not name:
-        raise _NotApplicable("it has no attributes model and state_0")
+        raise _NotMeasured("not applicable: it has no attributes model and state_0")
     if not model.tri_count + model.tet_count:
-        raise _NotApplicable("it has neither cloth nor soft bodies")
+        raise _NotMeasured("not applicable: it has neither cloth nor soft bodies")
     return name
 
 

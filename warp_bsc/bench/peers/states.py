@@ -7,7 +7,7 @@ import newton
 import numpy as np
 
 from ...detection.at_rest.body_parts import connect_cells
-from ...response.state.mesh import host_array
+from ...response.state.mesh import elements_of, host_array
 from ..scenes.contact import Motion
 
 
@@ -71,10 +71,7 @@ class Body:
 
 def find_bodies(model: newton.Model) -> list[Body]:
     """Returns the connected bodies of a model, each of one material, in the order of their first particles."""
-    triangles, tets = (
-        np.zeros((0, n), dtype=int) if indices is None else host_array(indices).reshape(-1, n).astype(int)
-        for indices, n in ((model.tri_indices, 3), (model.tet_indices, 4))
-    )
+    triangles, tets = elements_of(model.tri_indices, 3), elements_of(model.tet_indices, 4)
     pairs = np.concatenate(
         [elements[:, [i, j]] for elements in (triangles, tets) for i, j in combinations(range(elements.shape[1]), 2)]
     )

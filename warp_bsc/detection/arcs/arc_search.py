@@ -98,7 +98,7 @@ class ArcSearch:
         left = np.zeros(self._mesh.vertex_count, dtype=bool)
         for kind, contacts in self._detect(level, part, changed).items():
             keys = contacts.pairs.astype(np.int64) @ np.array([2**31, 1])
-            is_new = contacts.hit & ~_are_among(keys, self._keys[kind])
+            is_new = contacts.hit & ~np.isin(keys, self._keys[kind])
             corners, within = pair_distances(kind, self._elements[kind], contacts.pairs, self._deviation(level))
             ends = 2.0 * within <= self._bounds.tolerance  # arcs are that much farther apart than their chords
             left[corners[is_new & ~ends, 0]] = True  # one vertex of a pair suffices to find it again
@@ -107,7 +107,7 @@ class ArcSearch:
             found.toi = np.maximum(np.nextafter((part + found.toi) * 2.0**-level, -np.inf), part * 2.0**-level)
             if len(found.pairs):
                 self._found[kind].append(found)
-                self._keys[kind] = np.sort(np.concatenate([self._keys[kind], keys[is_new & ends]]), kind="stable")
+                self._keys[kind] = np.concatenate([self._keys[kind], keys[is_new & ends]])
         if left.any():
             vertices = wp.array(left, dtype=int, device=self._mesh.device)
             for half in range(2):
@@ -136,13 +136,6 @@ class ArcSearch:
         if level not in self._deviations:
             self._deviations[level] = self._bounds.deviation(level)
         return self._deviations[level]
-
-
-def _are_among(keys: np.ndarray, ascending: np.ndarray) -> np.ndarray:
-    """Returns which keys are among others, which are ascending, bool."""
-    if not len(ascending):
-        return np.zeros(len(keys), dtype=bool)
-    return ascending[np.minimum(np.searchsorted(ascending, keys), len(ascending) - 1)] == keys
 
 
 def join_contacts(parts: list[HostContacts]) -> HostContacts:

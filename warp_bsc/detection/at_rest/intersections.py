@@ -23,8 +23,6 @@ from ..results.collisions import Collisions
 from ..run.launch import launch_over, launch_over_queue, made_once, retry_until_fits
 from ..run.settings import NO_GRADIENTS, UNLIMITED, Count, Counters, capacity_for
 
-_FOUND = wp.constant(int(Count.FOUND))
-_QUEUED = wp.constant(int(Count.QUEUED))
 _PAIRS_OF_HIT = 8
 """Pairs of an edge and a face for each collision, roughly. If these are more than the edges, a search is faster."""
 
@@ -49,7 +47,7 @@ def _keep_crossings(dtype: type) -> wp.Kernel:
         status: wp.array[wp.int8],
     ):
         i = first + wp.tid()
-        if not is_filled(i, pairs, counts, _QUEUED):
+        if not is_filled(i, pairs, counts, Count.QUEUED):
             return
         edge = pairs[i][0]
         face = pairs[i][1]
@@ -63,7 +61,7 @@ def _keep_crossings(dtype: type) -> wp.Kernel:
             if edge_beside_face(p, q, a, b, c):
                 certified = FREE
         if certified != FREE:
-            slot = take_slot(counts, _FOUND)
+            slot = take_slot(counts, Count.FOUND)
             if slot < wp.int64(kept.shape[0]):
                 kept[wp.int32(slot)] = pairs[i]
                 status[wp.int32(slot)] = wp.int8(certified)

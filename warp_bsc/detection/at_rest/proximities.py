@@ -10,6 +10,7 @@ from ... import checker
 from ..._arguments import check_finite, check_instance, checked_choice, checked_coordinates, checked_distance
 from ..._one_thread import one_at_a_time
 from ...kernels.distance import DISTANCE_ERROR, closest_points
+from ...kernels.motion import double
 from ...kernels.pairs import points_of_pair
 from ...kernels.pipeline.queues import is_filled, take_slot
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
@@ -23,8 +24,6 @@ from ..run.launch import launch_over_queue, made_once, retry_until_fits
 from ..run.settings import NO_GRADIENTS, Count, Counters, PairCounts, PairKind, capacity_for
 from ..run.start import checked_device
 
-_FOUND = wp.constant(int(Count.FOUND))
-_QUEUED = wp.constant(int(Count.QUEUED))
 _LARGEST = 2.0**1000
 """Largest coordinate: differences and their sums stay finite."""
 _SMALLEST = 2.0**-1000
@@ -35,10 +34,6 @@ _FIRST_SEARCHED = 0.125
 @made_once
 def _keep_proximities(dtype: type) -> wp.Kernel:
     """Returns the kernel that keeps the pairs that are near and not within the rings, for one type of position."""
-
-    @wp.func
-    def point(x: wp.array[dtype], vertex: int) -> wp.vec3d:
-        return wp.vec3d(wp.float64(x[vertex][0]), wp.float64(x[vertex][1]), wp.float64(x[vertex][2]))
 
     @wp.kernel(**NO_GRADIENTS)
     def keep_proximities(
@@ -59,13 +54,13 @@ def _keep_proximities(dtype: type) -> wp.Kernel:
         kept_position: wp.array[wp.vec3d],
     ):
         i = first + wp.tid()
-        if not is_filled(i, pairs, counts, _QUEUED):
+        if not is_filled(i, pairs, counts, Count.QUEUED):
             return
         corners = points_of_pair(kind, elements, pairs[i])
-        p = point(x, corners[0])
-        q = point(x, corners[1])
-        r = point(x, corners[2])
-        s = point(x, corners[3])
+        p = double(x[corners[0]])
+        q = double(x[corners[1]])
+        r = double(x[corners[2]])
+        s = double(x[corners[3]])
         # vertex p with face q r s, which may have collapsed, or edge p q with edge r s
         u = r - q
         v = s - q
@@ -83,7 +78,7 @@ def _keep_proximities(dtype: type) -> wp.Kernel:
             return
         if are_within_rings(corners, firsts, rings):
             return
-        slot = take_slot(counts, _FOUND)
+        slot = take_slot(counts, Count.FOUND)
         if slot < wp.int64(kept.shape[0]):
             one = p
             other = q + coordinates[0] * u + coordinates[1] * v

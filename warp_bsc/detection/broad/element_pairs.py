@@ -24,11 +24,6 @@ from ..run.launch import made_once
 from ..run.settings import NO_GRADIENTS, Count
 from .face_hierarchy import FaceHierarchy
 
-_FILTERED = wp.constant(int(Count.FILTERED))
-_QUEUED = wp.constant(int(Count.QUEUED))
-
-_WIDTH = wp.constant(WIDTH)
-
 _PAIRS_OF_THREAD = wp.constant(4)
 """Most pairs of faces whose elements a thread pairs at once."""
 _PAIRS_AT_ONCE = wp.constant(1 << 17)
@@ -257,7 +252,7 @@ def pair_elements_kernel(padded: bool, swept: bool) -> wp.Kernel:
         queued = wp.vec2i()  # vertex-face, edge-edge
         filtered = wp.vec2i()
         for turn in range(turns):
-            at = first + turn * _WIDTH
+            at = first + turn * WIDTH
             if is_filled(at, face_pairs.pairs, face_pairs.counts, 0):
                 face = face_pairs.pairs[at][0]
                 other = face_pairs.pairs[at][1]
@@ -272,14 +267,14 @@ def pair_elements_kernel(padded: bool, swept: bool) -> wp.Kernel:
                 queued[1] += count_set_bits(wp.uint32(pairs & ~_VERTEX_FACE_BITS))
                 found = found | (wp.uint64(pairs) << wp.uint64(_BITS_OF_PAIR * turn))
         if mesh.pair_filter.group:
-            raise_count(vertex_face.counts, _FILTERED, filtered[0])
-            raise_count(edge_edge.counts, _FILTERED, filtered[1])
-        vertex_face_slot = take_slots(vertex_face.counts, _QUEUED, queued[0])
-        edge_edge_slot = take_slots(edge_edge.counts, _QUEUED, queued[1])
+            raise_count(vertex_face.counts, Count.FILTERED, filtered[0])
+            raise_count(edge_edge.counts, Count.FILTERED, filtered[1])
+        vertex_face_slot = take_slots(vertex_face.counts, Count.QUEUED, queued[0])
+        edge_edge_slot = take_slots(edge_edge.counts, Count.QUEUED, queued[1])
         while found != wp.uint64(0):
             bit = lowest_bit(found)
             found = found & (found - wp.uint64(1))
-            at = first + (bit / _BITS_OF_PAIR) * _WIDTH
+            at = first + (bit / _BITS_OF_PAIR) * WIDTH
             bit = bit % _BITS_OF_PAIR
             face = face_pairs.pairs[at][0]
             other = face_pairs.pairs[at][1]
@@ -300,7 +295,7 @@ def pair_elements_kernel(padded: bool, swept: bool) -> wp.Kernel:
         i = wp.tid()
         count = filled_entries(face_pairs.pairs, face_pairs.counts, 0)
         turns = wp.clamp(count / _PAIRS_AT_ONCE, 1, _PAIRS_OF_THREAD)
-        for first in range((i / _WIDTH) * turns * _WIDTH + i % _WIDTH, count, turns * threads):
+        for first in range((i / WIDTH) * turns * WIDTH + i % WIDTH, count, turns * threads):
             pair_some(mesh, face_pairs, first, turns, vertex_face, edge_edge)
 
     return pair_elements
@@ -322,10 +317,10 @@ def pair_edges_with_faces_kernel(padded: bool, swept: bool) -> wp.Kernel:
                 other = face_pairs.pairs[i][1 - bit / 3]
                 side = bit % 3
                 if is_filtered(mesh.pair_filter, _side(mesh.faces, place, side), _corners(mesh.faces, other)):
-                    take_slot(edge_face.counts, _FILTERED)
+                    take_slot(edge_face.counts, Count.FILTERED)
                 else:
                     pair = wp.vec2i(mesh.face_edges[place, side], mesh.order[other])
-                    append(pair, edge_face.pairs, edge_face.counts, _QUEUED)
+                    append(pair, edge_face.pairs, edge_face.counts, Count.QUEUED)
 
     return pair_edges_with_faces
 
@@ -348,14 +343,14 @@ def pair_points_kernel(padded: bool, swept: bool) -> wp.Kernel:
         is_point = cell >= mesh.point_start
         if is_filtered(mesh.pair_filter, wp.vec3i(p), _corners(mesh.faces, other)):
             if is_point:
-                take_slot(vertex_vertex.counts, _FILTERED)
+                take_slot(vertex_vertex.counts, Count.FILTERED)
             else:
-                take_slot(vertex_edge.counts, _FILTERED)
+                take_slot(vertex_edge.counts, Count.FILTERED)
             _count_filtered(mesh, place, 1)
         elif is_point:
-            append(wp.vec2i(wp.min(p, q), wp.max(p, q)), vertex_vertex.pairs, vertex_vertex.counts, _QUEUED)
+            append(wp.vec2i(wp.min(p, q), wp.max(p, q)), vertex_vertex.pairs, vertex_vertex.counts, Count.QUEUED)
         else:
-            append(wp.vec2i(p, mesh.face_edges[other, 0]), vertex_edge.pairs, vertex_edge.counts, _QUEUED)
+            append(wp.vec2i(p, mesh.face_edges[other, 0]), vertex_edge.pairs, vertex_edge.counts, Count.QUEUED)
 
     @wp.kernel(**NO_GRADIENTS)
     def pair_points(mesh: FaceHierarchy, face_pairs: Pairs, vertex_edge: Pairs, vertex_vertex: Pairs, threads: int):

@@ -40,8 +40,6 @@ from ..mesh import CollisionMesh
 from ..run.launch import made_once
 from ..run.settings import NO_GRADIENTS
 
-_WIDTH = wp.constant(WIDTH)
-
 _FEW_BUNDLES = 8
 """Number of bundles up to which all of them are traversed: their boxes would take longer than they save."""
 
@@ -221,15 +219,15 @@ def traversal_kernel(visit: Callable, arguments_type: type) -> wp.Kernel:
     @wp.kernel(**NO_GRADIENTS)
     def traverse(mesh: FaceHierarchy, warps_of_cluster: int, arguments: arguments_type):
         i = wp.tid()
-        cluster = i / (_WIDTH * warps_of_cluster)
-        part = (i / _WIDTH) % warps_of_cluster
-        place = cluster * _WIDTH + i % _WIDTH
+        cluster = i / (WIDTH * warps_of_cluster)
+        part = (i / WIDTH) % warps_of_cluster
+        place = cluster * WIDTH + i % WIDTH
         box = read_box(mesh.places.boxes, place)
         cluster_box = read_box(mesh.clusters.boxes, cluster)
-        own_bundle = cluster / _WIDTH
+        own_bundle = cluster / WIDTH
         turn = int(0)
-        count = (mesh.clusters.boxes.shape[0] - 1) / _WIDTH + 1
-        for first_bundle in range(own_bundle, count, _WIDTH):
+        count = (mesh.clusters.boxes.shape[0] - 1) / WIDTH + 1
+        for first_bundle in range(own_bundle, count, WIDTH):
             bundles = wp.uint32(0)
             if mesh.bundles.boxes:
                 bundles = unseparated_children(mesh.clusters, cluster, cluster_box, mesh.bundles, first_bundle)
@@ -238,11 +236,11 @@ def traversal_kernel(visit: Callable, arguments_type: type) -> wp.Kernel:
             while bundles != wp.uint32(0):
                 bundle = first_bundle + lowest_set_bit(bundles)
                 bundles = bundles & (bundles - wp.uint32(1))
-                clusters = unseparated_children(mesh.clusters, cluster, cluster_box, mesh.clusters, bundle * _WIDTH)
+                clusters = unseparated_children(mesh.clusters, cluster, cluster_box, mesh.clusters, bundle * WIDTH)
                 if bundle == own_bundle:
-                    clusters = clusters & bits_from(cluster % _WIDTH)
+                    clusters = clusters & bits_from(cluster % WIDTH)
                 while clusters != wp.uint32(0):
-                    first = (bundle * _WIDTH + lowest_set_bit(clusters)) * _WIDTH
+                    first = (bundle * WIDTH + lowest_set_bit(clusters)) * WIDTH
                     clusters = clusters & (clusters - wp.uint32(1))
                     if turn % warps_of_cluster == part:
                         faces = unseparated_children(mesh.clusters, cluster, cluster_box, mesh.places, first)

@@ -17,8 +17,6 @@ from ..run.settings import NO_GRADIENTS, Count
 
 _CODE_BITS = 10
 """Bits of a Hilbert code an axis."""
-_QUEUED = wp.constant(int(Count.QUEUED))
-_FILTERED = wp.constant(int(Count.FILTERED))
 _LOOSE = 1.5
 """Trees are sorted again if the sum of the sizes of their packets has grown by this factor since they were sorted."""
 _FEW = 2048
@@ -180,8 +178,8 @@ def _pair_packets(
         at_end,
         counts,
         filtered_of_worlds,
-        _QUEUED,
-        _FILTERED,
+        Count.QUEUED,
+        Count.FILTERED,
         pairs,
     )
 

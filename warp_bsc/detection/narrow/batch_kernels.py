@@ -24,12 +24,6 @@ from ..run.launch import made_once
 from ..run.settings import NO_FUSED_OPERATIONS, Count, PairKind
 from .pair_kernels import PairBuffers, write_decision, write_impact
 
-_QUEUED = wp.constant(int(Count.QUEUED))
-_SURVIVORS = wp.constant(int(Count.SURVIVORS))
-_CONTACTS = wp.constant(int(Count.CONTACTS))
-_FOUND = wp.constant(int(Count.FOUND))
-_UNSURE = wp.constant(int(Count.UNSURE))
-_FOR_EXACT = wp.constant(int(Count.FOR_EXACT))
 _LOWER_BITS = wp.constant(wp.uint64(0x5555555555555555))
 """The lower of the two bits of each status of a batch."""
 
@@ -73,14 +67,14 @@ def batch_culling_kernel(kind: PairKind, dtype: type, on_arcs: bool) -> wp.Kerne
         buffers: PairBuffers,
     ):
         i = BATCH * (first + wp.tid())
-        filled = wp.int32(wp.min(buffers.counts[_QUEUED], wp.int64(buffers.queue.shape[0])))
+        filled = wp.int32(wp.min(buffers.counts[Count.QUEUED], wp.int64(buffers.queue.shape[0])))
         count = wp.min(BATCH, filled - i)
         straight = count
         if wp.static(on_arcs):
             if any_turns(arcs):
                 straight = _move_turning_pairs(kind_number, buffers, arcs, i, count)
         left = cull_batch(x0, x1, buffers.elements, buffers.queue, i, straight, roundoff)
-        slot = take_slots(buffers.counts, _SURVIVORS, count_bits(left))
+        slot = take_slots(buffers.counts, Count.SURVIVORS, count_bits(left))
         while left != wp.uint64(0):
             write(buffers.queue[i + lowest_bit(left)], buffers.survivors, slot)
             slot += wp.int64(1)
@@ -121,7 +115,7 @@ def batch_classification_kernel(kind: PairKind, dtype: type) -> wp.Kernel:
         buffers: PairBuffers,
     ):
         i = CLASSIFIED * (first + wp.tid())
-        number = wp.min(CLASSIFIED, filled_entries(buffers.survivors, buffers.counts, _SURVIVORS) - i)
+        number = wp.min(CLASSIFIED, filled_entries(buffers.survivors, buffers.counts, Count.SURVIVORS) - i)
         statuses = classify_batch(x0, x1, buffers.elements, buffers.survivors, i, number, roundoff)
         left = statuses & (statuses >> wp.uint64(1)) & _LOWER_BITS
         while left != wp.uint64(0):
@@ -133,7 +127,7 @@ def batch_classification_kernel(kind: PairKind, dtype: type) -> wp.Kernel:
             statuses = statuses ^ (wp.uint64(OPEN ^ status) << wp.uint64(bit))
             left = left & (left - wp.uint64(1))
         contacts = (statuses | (statuses >> wp.uint64(1))) & _LOWER_BITS
-        slot = take_slots(buffers.counts, _CONTACTS, count_bits(contacts))
+        slot = take_slots(buffers.counts, Count.CONTACTS, count_bits(contacts))
         while contacts != wp.uint64(0):
             bit = lowest_bit(contacts)
             if slot < wp.int64(buffers.contacts.pairs.shape[0]):
@@ -161,10 +155,10 @@ def _decide_batch(first: int, count: int, timed: bool, buffers: PairBuffers):
                 unsure += 1
             if status == wp.int8(UNSURE) or (timed and not contacts.within_tolerance[i]):
                 for_exact += 1
-    raise_count(buffers.counts, _FOUND, found)
-    raise_count(buffers.counts, _UNSURE, unsure)
+    raise_count(buffers.counts, Count.FOUND, found)
+    raise_count(buffers.counts, Count.UNSURE, unsure)
     if for_exact > 0:
-        slot = wp.int32(take_slots(buffers.counts, _FOR_EXACT, for_exact))
+        slot = wp.int32(take_slots(buffers.counts, Count.FOR_EXACT, for_exact))
         for i in range(first, first + count):
             status = contacts.status[i]
             if status == wp.int8(UNSURE) or (status != wp.int8(FREE) and timed and not contacts.within_tolerance[i]):
@@ -192,7 +186,7 @@ def batch_impact_kernel(kind: PairKind, dtype: type) -> wp.Kernel:
     ):
         contacts = buffers.contacts
         i = DECIDED * (first + wp.tid())
-        number = wp.min(DECIDED, filled_entries(contacts.pairs, buffers.counts, _CONTACTS) - i)
+        number = wp.min(DECIDED, filled_entries(contacts.pairs, buffers.counts, Count.CONTACTS) - i)
         left = impact_batch(
             x0,
             x1,

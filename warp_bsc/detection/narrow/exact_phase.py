@@ -33,17 +33,13 @@ from .pair_kernels import PairBuffers
 _WIDTHS_ON_GPU = (1, 2, 8)
 """Limbs of the integers on a GPU, where a launch over an empty queue takes longer than four limbs would save."""
 
-_CONTACTS = wp.constant(int(Count.CONTACTS))
-_TOO_WIDE = wp.constant(int(Count.TOO_WIDE_8))
-_REFUTED = wp.constant(int(Count.REFUTED))
-
 
 @wp.func
 def _refute(i: int, buffers: PairBuffers):
     """Writes that a contact is none."""
     buffers.contacts.decided[i] = wp.int8(FREE)
     buffers.keys[i] = buffers.last_key
-    take_slot(buffers.counts, _REFUTED)
+    take_slot(buffers.counts, Count.REFUTED)
 
 
 @made_once
@@ -117,7 +113,7 @@ def _distance_kernel(dtype: type, limbs: int) -> wp.Kernel:
     ):
         k = first + wp.tid()
         contacts = buffers.contacts
-        if k >= contacts.pairs.shape[0] or wp.int64(k) >= buffers.counts[_CONTACTS]:
+        if k >= contacts.pairs.shape[0] or wp.int64(k) >= buffers.counts[Count.CONTACTS]:
             return
         known = int(contacts.decided[k])
         if known == FREE or (known == HIT and (contacts.within_tolerance[k] or not timed)):
@@ -133,7 +129,7 @@ def _distance_kernel(dtype: type, limbs: int) -> wp.Kernel:
             contacts.decided[k] = wp.int8(status)
             contacts.within_tolerance[k] = timed
         elif wp.static(is_last):
-            take_slot(buffers.counts, _TOO_WIDE)
+            take_slot(buffers.counts, Count.TOO_WIDE_8)
 
     return decide_distances
 
@@ -154,7 +150,7 @@ def are_within_distance(
     buffers = PairBuffers()
     buffers.elements = elements
     buffers.counts = wp.zeros(len(Count), dtype=wp.int64, device=device)
-    buffers.counts[_CONTACTS : _CONTACTS + 1].fill_(n)
+    buffers.counts[Count.CONTACTS : Count.CONTACTS + 1].fill_(n)
     buffers.contacts = make_contact_buffer(n, device)
     buffers.contacts.pairs.assign(pairs)
     buffers.contacts.decided.fill_(int(UNSURE))

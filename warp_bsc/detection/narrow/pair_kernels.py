@@ -17,13 +17,6 @@ from ..run.launch import made_once
 from ..run.settings import NO_FUSED_OPERATIONS, NO_GRADIENTS, Count
 from .contact_buffer import ContactBuffer
 
-_QUEUED = wp.constant(int(Count.QUEUED))
-_SURVIVORS = wp.constant(int(Count.SURVIVORS))
-_CONTACTS = wp.constant(int(Count.CONTACTS))
-_FOUND = wp.constant(int(Count.FOUND))
-_UNSURE = wp.constant(int(Count.UNSURE))
-_REFUTED = wp.constant(int(Count.REFUTED))
-
 
 @wp.struct
 class PairBuffers:
@@ -87,7 +80,7 @@ def entry_of_two(
 @wp.func
 def take_contact(pair: wp.vec2i, buffers: PairBuffers) -> int:
     """Returns the row of a new contact, to which the pair is written; -1 if no row remains."""
-    slot = take_slot(buffers.counts, _CONTACTS)
+    slot = take_slot(buffers.counts, Count.CONTACTS)
     if slot >= wp.int64(buffers.contacts.pairs.shape[0]):
         return -1
     k = wp.int32(slot)
@@ -120,9 +113,9 @@ def write_decision(k: int, status: int, buffers: PairBuffers):
 @wp.func
 def count_found(status: int, buffers: PairBuffers):
     """Counts a contact that is found."""
-    take_slot(buffers.counts, _FOUND)
+    take_slot(buffers.counts, Count.FOUND)
     if status == UNSURE:
-        take_slot(buffers.counts, _UNSURE)
+        take_slot(buffers.counts, Count.UNSURE)
 
 
 @wp.func
@@ -199,7 +192,7 @@ def cull_kernel(rule: PairRule, dtype: type, of_kind: int = -1) -> wp.Kernel:
         if wp.static(of_kind >= 0):
             kind = wp.static(of_kind)
         i = first + wp.tid()  # and no pair, which would take registers until the end
-        v = _vertices_at(i, kind, buffers.queue, buffers.elements, buffers.counts, _QUEUED)
+        v = _vertices_at(i, kind, buffers.queue, buffers.elements, buffers.counts, Count.QUEUED)
         if v[0] < 0:
             return
         if wp.static(turning is not None):
@@ -208,7 +201,7 @@ def cull_kernel(rule: PairRule, dtype: type, of_kind: int = -1) -> wp.Kernel:
         if excludes(options, kind, v):
             return
         if not clears(options, kind, v, x0, x1):
-            append(buffers.queue[i], buffers.survivors, buffers.counts, _SURVIVORS)
+            append(buffers.queue[i], buffers.survivors, buffers.counts, Count.SURVIVORS)
 
     return cull
 
@@ -241,7 +234,7 @@ def decide_kernel(rule: PairRule, dtype: type) -> wp.Kernel:
             if not any_turns(options.arcs):
                 return
         i = first + wp.tid()
-        kind, k, v = entry_of_two(i, kinds, one.survivors, other.survivors, one, other, _SURVIVORS)
+        kind, k, v = entry_of_two(i, kinds, one.survivors, other.survivors, one, other, Count.SURVIVORS)
         if v[0] < 0:
             return
         if wp.static(turning is not None):
@@ -269,7 +262,7 @@ def pad_keys(
 ):
     """Writes the last key to the rows after the contacts."""
     i = first + wp.tid()
-    if wp.int64(i) >= counts[_CONTACTS]:
+    if wp.int64(i) >= counts[Count.CONTACTS]:
         keys[i] = last_key
 
 
@@ -285,7 +278,7 @@ def gather_contacts(
 ):
     """Writes contacts in an order, and the pair (-1, -1) where there are no more."""
     i = first + wp.tid()
-    if wp.int64(i) >= counts[_FOUND] - counts[_REFUTED]:
+    if wp.int64(i) >= counts[Count.FOUND] - counts[Count.REFUTED]:
         ordered.pairs[i] = wp.vec2i(-1, -1)
         return
     source = order[i]

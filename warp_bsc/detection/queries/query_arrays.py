@@ -20,7 +20,6 @@ from .query_points import elements_of_rows
 _MAX_QUERIES = 2**28 - 1
 """Their eight points each are numbered by int32."""
 
-_CONTACTS = wp.constant(int(Count.CONTACTS))
 _FLOAT, _CONSERVATIVE, _EXACT = (wp.constant(METHODS.index(method)) for method in METHODS)
 
 
@@ -80,7 +79,7 @@ def _write_contacts(
 ):
     """Writes the rows of the contacts that are not certified free, but for queries that are not finite."""
     slot = first + wp.tid()
-    if wp.int64(slot) >= buffers.counts[_CONTACTS]:
+    if wp.int64(slot) >= buffers.counts[Count.CONTACTS]:
         return
     contacts = buffers.contacts
     status = contacts.status[slot]

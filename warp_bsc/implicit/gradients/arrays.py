@@ -22,11 +22,17 @@ def with_gradients(struct, names=(), **gradients):
         array = getattr(struct, name)
         gradient = gradients[name] if name in gradients else wp.zeros_like(array, requires_grad=False)
         setattr(of_struct, name, gradient)
-        if len(array):
-            alias = array[:]
-            alias.grad, alias.retain_grad = gradient, True  # which a store would clear
-            setattr(into, name, alias)
+        setattr(into, name, with_gradient(array, gradient))
     return into, of_struct
+
+
+def with_gradient(values: wp.array, gradient: wp.array | None) -> wp.array:
+    """Returns an array of the same values whose gradient is another array; the values themselves if that is None."""
+    if gradient is None or not len(values):
+        return values
+    alias = values[:]
+    alias.grad, alias.retain_grad = gradient, True  # which a store would clear
+    return alias
 
 
 def copied_materials(materials: Materials) -> Materials:

@@ -28,10 +28,12 @@ from typing import Any
 import newton
 import numpy as np
 import warp as wp
-from newton import BodyFlags, ParticleFlags
+from newton import ParticleFlags
 
 from ..._private_names.of_warp import paused_tape
 from ..._private_names.tape_access import Access, access_to, arrays_of_launch
+from ...response.state.mesh import dynamic_bodies
+from .kernels import Count
 
 wp.set_module_options({"enable_backward": False})
 
@@ -135,7 +137,7 @@ def _set_aside(
             else:
                 outcome = STAYS
             if outcome != STAYS:
-                wp.atomic_add(counts, 0, wp.int64(1))
+                wp.atomic_add(counts, int(Count.AMBIGUOUS_MOVES), wp.int64(1))
     fate[i] = outcome
     if outcome <= RESTS:
         return
@@ -236,7 +238,7 @@ class BetweenSteps:
 
         Args:
             model: The model.
-            counts: Gradients of moved particles and bodies that are NaN are added to its first element.
+            counts: Those of :class:`.report.GradientReport`, to which gradients that are NaN are added.
         """
         self._model, self._counts = model, counts
         self._tape: Callable[[], object] = lambda: None  # a weak reference
@@ -254,10 +256,7 @@ class BetweenSteps:
             assert model.particle_inv_mass is not None and model.particle_flags is not None
             active = model.particle_flags.numpy() & int(ParticleFlags.ACTIVE) != 0
             self._add("particle_q", ~active | (model.particle_inv_mass.numpy() == 0.0))
-        if model.body_count:
-            assert model.body_inv_mass is not None and model.body_flags is not None
-            kinematic = model.body_flags.numpy() & int(BodyFlags.KINEMATIC) != 0
-            self._add("body_q", kinematic | (model.body_inv_mass.numpy() == 0.0))
+        self._add("body_q", ~dynamic_bodies(model))
 
     def _add(self, name, kinematic):
         if kinematic.any():

@@ -186,7 +186,7 @@ class Checkpoints:
             of_states = _gradients_of(border)
             for name, gradient in _gradients_of(state_in).items():
                 values, sums = _flat(of_states[name], float), _flat(gradient, float)
-                self._launch(add_to, len(sums), [values], [sums])
+                gradients.work.launch(add_to, len(sums), [values], [sums])
             self._restart(after)
             gradients.report.copy_counts()
 
@@ -222,15 +222,13 @@ class Checkpoints:
 
     def _check(self, end, saved):
         """Makes the gradients at the end of a segment NaN if it is not the end that the steps had before."""
+        work = self._gradients.work
         self._changed.zero_()
-        of_end, last = dict(_arrays_of(end)), self._gradients.work.motion.last.arrays
+        of_end, last = dict(_arrays_of(end)), work.motion.last.arrays
         kept = [*of_end.items(), *(("last step", x) for x in last)]
         for before, (name, now) in zip(saved, kept, strict=False):
             if len(now) and name in (*_ENDS, "last step"):
                 bits = _flat(now, int)
-                self._launch(_find_changed, len(bits), [_flat(before, int), bits], [self._changed])
+                work.launch(_find_changed, len(bits), [_flat(before, int), bits], [self._changed])
         of_end = _flat(end.particle_q.grad, float)
-        self._launch(_lose, len(of_end), [self._changed], [of_end, self._gradients.report.counts])
-
-    def _launch(self, kernel, size, inputs, outputs):
-        wp.launch(kernel, size, inputs=inputs, outputs=outputs, device=self._changed.device)
+        work.launch(_lose, len(of_end), [self._changed], [of_end, self._gradients.report.counts])

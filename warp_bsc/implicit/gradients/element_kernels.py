@@ -4,8 +4,6 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
-_ONE = wp.constant(wp.float64(1.0))
-
 
 @wp.kernel
 def gather(
@@ -37,19 +35,6 @@ def scatter(
     v = vertices[e, i]
     if v >= 0:
         wp.atomic_add(of_particles, v, of_elements[e, 0, i])
-
-
-@wp.kernel
-def set_units(
-    # out
-    units: wp.array3d[wp.vec3d],
-):
-    """Sets row 3 i + j of each element to the unit vector j of its vertex i."""
-    e, row, i = wp.tid()
-    unit = wp.vec3d()
-    if row // 3 == i:
-        unit[row % 3] = _ONE
-    units[e, row, i] = unit
 
 
 @wp.func

@@ -6,13 +6,12 @@ forces. To compute a Jacobian there is one row for each component of force: the 
 is row i of the Jacobian. All is computed in float64 from the values in float32.
 """
 
-from collections.abc import Sequence
-
+import numpy as np
 import warp as wp
 
 from ..._private_names.of_warp import empty_struct, struct_fields, struct_type
 from . import element_kernels
-from .arrays import launch_adjoint
+from .arrays import launch_adjoint, with_gradient
 
 
 class Elements:
@@ -24,6 +23,7 @@ class Elements:
         vertices: Vertices of the elements, -1 for none, int32, shape [capacity, size].
         rows: The unknown of each of these, -1 for none.
         count: Elements in use.
+        parameters: What the kernel reads beside positions; arrays that require gradients get them.
         forces: Forces on the vertices, vec3d, shape [capacity, 1, size].
         jacobian: Derivatives of the forces with respect to positions at the end, float64, shape
             [capacity, 3 size, size] of vec3: row 3 i + j belongs to component j of the force on particle i.
@@ -34,7 +34,6 @@ class Elements:
         kernel: wp.Kernel,
         vertices: wp.array,
         rows: wp.array,
-        parameters: Sequence = (),
         jacobians: wp.Kernel | None = None,
     ):
         """Allocates buffers for forces on ``vertices``.
@@ -43,23 +42,23 @@ class Elements:
             kernel: A kernel of the form above.
             vertices: Vertices of the elements, int32, shape [capacity, size].
             rows: Their unknowns, likewise.
-            parameters: What the kernel reads beside positions; arrays that require gradients get them.
             jacobians: A kernel that computes Jacobians from the same but the time, in place of adjoints, a corner each.
         """
         self._jacobians = jacobians
-        self.kernel, self.vertices, self.rows, self.parameters = kernel, vertices, rows, list(parameters)
+        self.kernel, self.vertices, self.rows, self.parameters = kernel, vertices, rows, []
         self.device = device = vertices.device
         self.count, self._size = vertices.shape
-        shape, rows = (self.count, 1, self._size), 3 * self._size
+        shape, components = (self.count, 1, self._size), 3 * self._size
 
         def zeros(*dimensions):
             return wp.zeros(dimensions, dtype=wp.vec3d, device=device)
 
         self._x1, self._x0, self.forces = zeros(*shape), zeros(*shape), zeros(*shape)
         self._of_x1, self._of_x0, self._of_forces = zeros(*shape), zeros(*shape), zeros(*shape)
-        self.jacobian = zeros(self.count, rows, self._size)
-        self._units = zeros(1, rows, self._size)
-        self._launch(element_kernels.set_units, self._units.shape, [], [self._units])
+        self.jacobian = zeros(self.count, components, self._size)
+        if jacobians is None:
+            units = np.eye(components).reshape(1, components, self._size, 3)
+            self._units = wp.array(units, dtype=wp.vec3d, device=device)
 
     def load(self, x1: wp.array, x0: wp.array) -> None:
         """Takes positions of vertices at the end and at the start of a step, vec3d."""
@@ -116,15 +115,6 @@ class Elements:
 
     def _launch(self, kernel, size, inputs, outputs):
         wp.launch(kernel, size, inputs=inputs, outputs=outputs, device=self.device)
-
-
-def with_gradient(values: wp.array, gradient: wp.array | None) -> wp.array:
-    """Returns an array of the same values whose gradient is another array; the values themselves if that is None."""
-    if gradient is None or not len(values):
-        return values
-    alias = values[:]
-    alias.grad, alias.retain_grad = gradient, True
-    return alias
 
 
 def without_gradients(value):

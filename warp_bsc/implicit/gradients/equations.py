@@ -18,11 +18,11 @@ from ...response.state.structs import Motion
 from ..contact.newton_method import NewtonMethod
 from ..contact.pairs import BarrierSettings
 from . import energies, kernels
-from .arrays import launch_adjoint
+from .arrays import launch_adjoint, with_gradient
 from .bodies import ContactsOnBodies, find_arms, inertial_forces_on_bodies
 from .contact_forces import RecordedContacts, contact_forces, contact_jacobians
 from .elastic import Elastic
-from .elements import Elements, with_gradient
+from .elements import Elements
 from .matrix import StepMatrix
 from .matrix_kernels import Matrix
 

@@ -69,11 +69,6 @@ class GradientReport:
         wp.copy(self._host, self.counts)
 
     @property
-    def ambiguous_moves(self) -> wp.array:
-        """The count of :attr:`GradientCounts.ambiguous_moves`, int64, shape [1]."""
-        return self.counts[Count.AMBIGUOUS_MOVES : Count.AMBIGUOUS_MOVES + 1]
-
-    @property
     def norms(self) -> np.ndarray:
         """Norm at the start of each step of the last tape, then at the end of the last, shape [steps + 1, worlds]."""
         if not self._norms:

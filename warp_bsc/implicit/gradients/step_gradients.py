@@ -18,11 +18,10 @@ from ...response.state.motion import StateArrays
 from ...response.state.workspace import Workspace
 from ..contact.newton_method import NewtonMethod
 from . import energies, kernels
-from .arrays import copied, copied_materials, launch_adjoint, materials_with_gradients, with_gradients
+from .arrays import copied, copied_materials, launch_adjoint, materials_with_gradients, with_gradient, with_gradients
 from .between_steps import BetweenSteps
 from .bodies import end_bodies, find_solved, leave_out_solved, predict_goals
 from .contact_forces import RecordedContacts
-from .elements import with_gradient
 from .equations import SolvedBodies, SolvedStep, StepEquations
 from .linear import LinearSolver
 from .report import GradientReport, Place
@@ -125,7 +124,7 @@ class StepGradients:
         self._room = 0  # contacts that the arrays of a step in a CUDA graph have room for
         self._largest = wp.zeros(work.worlds, dtype=wp.int64, device=device)
         self._carried_to: wp.array | None = None  # norms of a step
-        self.between_steps = BetweenSteps(model, report.ambiguous_moves)
+        self.between_steps = BetweenSteps(model, report.counts)
         self.taken, self._places = 0, None
         self.forget_last()
 
@@ -163,32 +162,32 @@ class StepGradients:
         work, newton, model, device = self.work, self.newton, self._model, self.work.device
         motion, last, particles = work.motion.vertices, work.motion.last, model.particle_count
         x0, velocity = (wp.zeros(n, dtype=wp.vec3d, device=device) for n in (work.mesh.vertex_count, particles))
-        self._launch(kernels.to_double, len(x0), [newton.problem.trial.origin], [x0])
-        self._launch(kernels.to_double, particles, [start.particle_qd], [velocity])
+        work.launch(kernels.to_double, len(x0), [newton.problem.trial.origin], [x0])
+        work.launch(kernels.to_double, particles, [start.particle_qd], [velocity])
         is_fixed = wp.zeros(self.equations.count, dtype=int, device=device)
-        self._launch(kernels.find_fixed, len(is_fixed), [newton.problem.unknowns.is_free], [is_fixed])
+        work.launch(kernels.find_fixed, len(is_fixed), [newton.problem.unknowns.is_free], [is_fixed])
         is_held = wp.zeros(particles, dtype=int, device=device)
         if self.equations.attachments is not None:
             at = self.equations.attachments
             inputs = [at.particle, at.stiffness, at.enabled, work.step.motion]
-            self._launch(kernels.find_held, len(at.particle), inputs, [is_held])
+            work.launch(kernels.find_held, len(at.particle), inputs, [is_held])
         failed = wp.zeros(work.worlds, dtype=int, device=device)
-        self._launch(kernels.begin_failed, work.worlds, [self._converged], [failed])
+        work.launch(kernels.begin_failed, work.worlds, [self._converged], [failed])
         inputs = [newton.problem.trial, newton.problem.unknowns, end.particle_q, work.mesh.device_world]
-        self._launch(kernels.find_changed, particles, inputs, [failed])
+        work.launch(kernels.find_changed, particles, inputs, [failed])
         of_particles = wp.zeros(particles, dtype=int, device=device)
         inputs = [work.mesh.device_world, last.interrupted]
-        self._launch(kernels.find_continuing, particles, inputs, [of_particles])
+        work.launch(kernels.find_continuing, particles, inputs, [of_particles])
         of_bodies, poses, bodies = wp.zeros(model.body_count, dtype=int, device=device), (None, None), None
         if model.body_count:
             inputs = [model.body_world, last.interrupted]
-            self._launch(kernels.find_continuing, model.body_count, inputs, [of_bodies])
+            work.launch(kernels.find_continuing, model.body_count, inputs, [of_bodies])
             is_solved = wp.zeros(model.body_count, dtype=int, device=device)
             if self.equations.of_bodies is not None:
                 inputs = [self.equations.of_bodies, is_fixed]
-                self._launch(find_solved, model.body_count, inputs, [is_solved])
+                work.launch(find_solved, model.body_count, inputs, [is_solved])
             poses = wp.clone(end.body_q, requires_grad=False), wp.clone(last.poses)
-            self._launch(kernels.start_poses, model.body_count, [start.body_q, of_bodies, is_solved], [poses[1]])
+            work.launch(kernels.start_poses, model.body_count, [start.body_q, of_bodies, is_solved], [poses[1]])
             bodies = self._predict(dt, start, poses[1], is_solved)
         contacts = self._record_contacts(failed)
         of_motion = copied(motion, ["inverse_mass", "friction"])
@@ -217,7 +216,7 @@ class StepGradients:
         bodies = SolvedBodies(is_solved, start.body_qd, start.body_f, goals, velocities)
         if self.equations.of_bodies is not None:
             inputs = self._inputs_of_goals(bodies, poses, dt, self.work.motion.vertices.bodies)
-            self._launch(predict_goals, len(poses), inputs, [goals, velocities])
+            self.work.launch(predict_goals, len(poses), inputs, [goals, velocities])
         return bodies
 
     def _inputs_of_goals(self, bodies, poses, dt, of_motion):
@@ -239,7 +238,7 @@ class StepGradients:
         count, threads = wp.zeros(1, dtype=int, device=device), _THREADS if device.is_cuda else 1
         inputs = [newton.problem.contacts, newton.problem.unknowns, threads, count]
         outputs = [vertices, rows, kind, plane, failed]
-        self._launch(kernels.record_contacts, (threads, work.worlds), inputs, outputs)
+        work.launch(kernels.record_contacts, (threads, work.worlds), inputs, outputs)
         n = capacity
         if not device.is_capturing:
             n = int(count.numpy()[0])
@@ -268,7 +267,7 @@ class StepGradients:
             array.zero_()
         inputs = [dt, of.end_particle_q, of.end_particle_qd, equations.unknown, step.is_fixed, recorded.is_held]
         outputs = [self._of_unknowns, self._of_x1, norms]
-        self._launch(kernels.of_end, particles, [*inputs, self._carried_x, world], outputs)
+        self.work.launch(kernels.of_end, particles, [*inputs, self._carried_x, world], outputs)
         motion, of_motion = with_gradients(step.motion, ["inverse_mass", "friction"])
         table = self.work.motion.friction.materials.friction
         motion.materials, of_motion.materials = materials_with_gradients(step.motion.materials, table)
@@ -286,7 +285,7 @@ class StepGradients:
             poses = tuple(with_gradient(pose, of_pose) for pose, of_pose in zip(poses, of_poses, strict=True))
             wp.copy(of_poses[0], self._carried_poses)
             if of.end_body_q is not None:
-                self._launch(
+                self.work.launch(
                     kernels.split_end_poses, model.body_count, [bodies.is_solved, of.end_body_q], [of_poses[0]]
                 )
             if equations.of_bodies is not None:
@@ -302,7 +301,7 @@ class StepGradients:
         step = step._replace(contacts=contacts, motion=motion, planes=planes, poses=poses, bodies=bodies)
         equations.load(step)
         multipliers = self._linear.solve(equations.differentiate(transposed=True), self._of_unknowns)
-        self._launch(kernels.set_failed, equations.count, [equations.world, recorded.failed], [multipliers])
+        self.work.launch(kernels.set_failed, equations.count, [equations.world, recorded.failed], [multipliers])
         equations.add_gradients(multipliers, self._of_x1, self._of_x0, self._of_v0, of.particle_f)
         if model.body_count:
             self._go_to_poses(step, of_planes)
@@ -310,21 +309,21 @@ class StepGradients:
                 inputs = self._inputs_of_goals(bodies, poses[1], step.dt, motion.bodies)
                 launch_adjoint(predict_goals, model.body_count, inputs, [*of_goals], self.work.device)
                 if model.body_inv_mass.grad is not None:
-                    self._launch(
+                    self.work.launch(
                         kernels.add_to, model.body_count, [of_motion.bodies.inverse_mass], [model.body_inv_mass.grad]
                     )
             inputs = [recorded.of_bodies, bodies.is_solved, *of_poses]
-            self._launch(kernels.finish_poses, model.body_count, inputs, [of.body_q, self._carried_poses])
+            self.work.launch(kernels.finish_poses, model.body_count, inputs, [of.body_q, self._carried_poses])
         inputs = [dt, of.end_particle_qd, equations.unknown, step.is_fixed, recorded.is_held, recorded.of_particles]
         inputs += [self._of_x1, self._of_x0, self._of_v0, world]
         outputs = [of.particle_q, of.particle_qd, self._carried_x, norms, self._largest]
-        self._launch(kernels.finish_gradients, particles, inputs, outputs)
+        self.work.launch(kernels.finish_gradients, particles, inputs, outputs)
         inputs = [recorded.number, recorded.failed, self._linear.failed, self._largest]
-        self._launch(kernels.report_gradients, len(recorded.failed), inputs, [norms, self.report.counts])
+        self.work.launch(kernels.report_gradients, len(recorded.failed), inputs, [norms, self.report.counts])
         self.report.copy_counts()
         if model.particle_inv_mass.grad is not None:
             inputs = [of_motion.inverse_mass, step.motion.inverse_mass]
-            self._launch(kernels.add_inverse_masses, particles, inputs, [model.particle_inv_mass.grad])
+            self.work.launch(kernels.add_inverse_masses, particles, inputs, [model.particle_inv_mass.grad])
         if model.gravity.grad is not None:  # layers, by which barriers are stiffer, follow from it
             inputs = [wp.float32(step.dt), model.gravity]
             self._adjoint(energies.find_falls, self.work.worlds, inputs, of_contacts.fall)
@@ -347,7 +346,7 @@ class StepGradients:
         inputs = [bodies.is_solved, equations.of_bodies, changes, step.poses[0], bodies.goals, bodies.goal_velocities]
         launch_adjoint(end_bodies, n, [*inputs, of_motion, wp.float64(step.dt)], ends, self.work.device)
         inputs = [bodies.is_solved, equations.of_bodies, changes.grad]
-        self._launch(kernels.add_of_bodies, n, inputs, [self._of_unknowns])
+        self.work.launch(kernels.add_of_bodies, n, inputs, [self._of_unknowns])
 
     def _go_to_poses(self, step, of_planes):
         """Turns gradients with respect to what moves with bodies into those with respect to their poses."""
@@ -355,7 +354,7 @@ class StepGradients:
         shapes, infinite, poses = mesh.device_shape_vertices, mesh.device_planes, step.poses
         if self.equations.of_bodies is not None:
             inputs = [step.bodies.is_solved, shapes.body, particles]
-            self._launch(leave_out_solved, len(shapes.body), inputs, [self._of_x1])
+            self.work.launch(leave_out_solved, len(shapes.body), inputs, [self._of_x1])
         if at is not None:
             inputs = [at.particle.reshape((-1, 1)), at.body, at.body_point, at.stiffness, at.enabled, poses[0]]
             self._adjoint(energies.place_held, len(at.particle), inputs, self._of_x1)
@@ -370,9 +369,6 @@ class StepGradients:
 
     def _adjoint(self, kernel, size, inputs, gradient):
         launch_adjoint(kernel, size, inputs, [gradient], self.work.device)
-
-    def _launch(self, kernel, size, inputs, outputs):
-        wp.launch(kernel, size, inputs=inputs, outputs=outputs, device=self.work.device)
 
 
 def _first(array, n):

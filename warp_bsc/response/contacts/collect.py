@@ -24,8 +24,6 @@ from .rules import ContactClass
 
 wp.set_module_options({"enable_backward": False})
 
-_QUEUED = wp.constant(int(Count.QUEUED))
-
 
 @wp.func
 def _count_crossing(
@@ -54,7 +52,7 @@ def count_crossings(
     threads: int,
 ):
     """Counts the pairs (edge, face) that certainly cross at the start and that the response can move."""
-    for i in range(wp.tid(), filled_entries(pairs, counts, _QUEUED), threads):
+    for i in range(wp.tid(), filled_entries(pairs, counts, Count.QUEUED), threads):
         _count_crossing(step, pairs[i][0], pairs[i][1], count, of_worlds, of_edges)
 
 

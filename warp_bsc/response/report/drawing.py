@@ -30,11 +30,7 @@ class Drawing:
 
     def __init__(self, mesh: ModelMesh):
         """Measures the model."""
-        model, self._mesh = mesh.model, mesh
-        count, edges = model.particle_count, mesh.edges
-        edges = edges[(edges < count).all(axis=1)]
-        x = np.empty((0, 3)) if model.particle_q is None else model.particle_q.numpy()
-        lengths = np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1)
+        lengths = mesh.particle_edge_lengths()
         self.edge = float(np.median(lengths)) if len(lengths) else 0.05
         self._large = 0.0  # impulse, the largest of all steps so far [N s]
         radius = np.zeros(mesh.vertex_count) if mesh.distances is None else mesh.distances.radius.numpy()
@@ -42,9 +38,7 @@ class Drawing:
         self._radius, self._faces = radius, mesh.faces[has_shell[mesh.faces].all(axis=1)]
         self._lone = has_shell.copy()  # vertices whose shell is a sphere, as they are on no face
         self._lone[mesh.faces] = False
-        tets = model.tet_indices
-        if tets is not None:
-            self._lone[tets.numpy()] = False
+        self._lone[mesh.tets] = False
 
     def draw(
         self,

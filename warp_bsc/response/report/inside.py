@@ -6,13 +6,13 @@ from typing import NamedTuple
 
 import numpy as np
 import warp as wp
-from newton import BodyFlags, ParticleFlags
+from newton import ParticleFlags
 
 from ..._arguments import as_numpy
 from ...detection.at_rest.body_parts import connect_cells
 from ...detection.at_rest.containment import ContainmentFinder
 from ...detection.mesh import CollisionMesh
-from ..state.mesh import ModelMesh, elements_of, outer_sides
+from ..state.mesh import ModelMesh, dynamic_bodies, elements_of, outer_sides
 
 _ROUNDOFF, _TINY = 2.0**-50, 1e-300  # as in :func:`.state.planes.signed_distance`
 
@@ -84,12 +84,11 @@ class InsideFinder:
         mesh, model = self._mesh, self._mesh.model
         x = _checked(x, (mesh.vertex_count, 3), "x")
         planes = _checked(planes, (len(mesh.planes.shape), 4), "planes")
-        flags = _read(model.particle_flags, model.particle_count)
+        flags = np.zeros(0, dtype=int) if model.particle_flags is None else model.particle_flags.numpy()
         finite = np.isfinite(x).all(axis=1).reshape(-1)
         (particles,) = np.nonzero(finite[: model.particle_count] & ((flags & int(ParticleFlags.ACTIVE)) != 0))
         movable = mesh.inverse_masses.numpy() > 0.0
-        flags, inverse_mass = _read(model.body_flags, model.body_count), _read(model.body_inv_mass, model.body_count)
-        moves = np.append((inverse_mass > 0.0) & ((flags & int(BodyFlags.KINEMATIC)) == 0), False)  # -1 is no body
+        moves = np.append(dynamic_bodies(model), False)  # -1 is no body
         in_bodies = self._find_in_bodies(x, particles, finite, movable, moves)
         behind_planes = self._find_behind_planes(x[particles].astype(np.float64), particles, planes, movable, moves)
         rows = np.concatenate([in_bodies, behind_planes])
@@ -193,11 +192,6 @@ class InsideFinder:
 def _meet(bits: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Returns which groups and masks meet, each of shape [2, ...]."""
     return ((bits[0] & other[1]) != 0) & ((other[0] & bits[1]) != 0)
-
-
-def _read(values: wp.array | None, count: int) -> np.ndarray:
-    """Returns an array of a model on the host, zeros if the model has none."""
-    return np.zeros(count, dtype=np.int32) if values is None else values.numpy()
 
 
 def _checked(values: np.ndarray | wp.array, shape: tuple[int, ...], name: str) -> np.ndarray:

@@ -18,7 +18,7 @@ class Launches:
     body_count: int
     _threads: int  # of a launch over a queue
 
-    def launch(self, kernel: wp.Kernel, size: int, inputs: Sequence, outputs: Sequence = ()) -> None:
+    def launch(self, kernel: wp.Kernel, size: int | tuple[int, ...], inputs: Sequence, outputs: Sequence = ()) -> None:
         """Launches a kernel on the device."""
         wp.launch(kernel, size, inputs=inputs, outputs=outputs, device=self.device)
 

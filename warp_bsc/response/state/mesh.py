@@ -4,7 +4,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 import warp as wp
-from newton import GeoType, Model, ParticleFlags, ShapeFlags
+from newton import BodyFlags, GeoType, Model, ParticleFlags, ShapeFlags
 
 from ..._arguments import checked_integer
 from ...detection.mesh import CollisionMesh, ElementsOfParts
@@ -244,6 +244,13 @@ class ModelMesh(CollisionMesh):
         place.particle_q, place.body_q, place.shapes = particle_q, body_q, self.placed_shapes
         return place
 
+    def particle_edge_lengths(self) -> np.ndarray:
+        """Returns the lengths of the edges of cloth, soft bodies and ropes at rest [m], shape [n]."""
+        particle_q = self.model.particle_q
+        rest = np.zeros((0, 3)) if particle_q is None else particle_q.numpy()
+        edges = self.edges[self.edges[:, 1] < self.model.particle_count]
+        return np.linalg.norm(rest[edges[:, 1]] - rest[edges[:, 0]], axis=1)
+
     def refresh_inverse_masses(self) -> None:
         """Reads the inverse masses and flags of the model's particles again. Can be captured in a CUDA graph.
 
@@ -341,6 +348,14 @@ def members_of_worlds(world: np.ndarray, worlds: int) -> np.ndarray:
 def are_infinite_planes(model: Model) -> np.ndarray:
     """Returns which shapes of a model are infinite planes, shape [shape_count]."""
     return (host_array(model.shape_type) == GeoType.PLANE) & (host_array(model.shape_scale)[:, :2] <= 0.0).any(axis=1)
+
+
+def dynamic_bodies(model: Model) -> np.ndarray:
+    """Returns which bodies of a model are neither kinematic nor without mass, shape [body_count]."""
+    if not model.body_count:
+        return np.zeros(0, dtype=bool)
+    is_kinematic = (host_array(model.body_flags) & BodyFlags.KINEMATIC) != 0
+    return (host_array(model.body_inv_mass) > 0.0) & ~is_kinematic
 
 
 def elements_of(indices: wp.array | None, n: int) -> np.ndarray:

@@ -6,6 +6,7 @@ from itertools import pairwise
 import numpy as np
 from pxr import Usd, UsdGeom
 
+from ..turns import BETWEEN, are_bent
 from .instancers import Instance, are_finite, masking_attributes, transform_attributes, transform_ops, transform_times
 from .samples import may_jump
 
@@ -15,8 +16,6 @@ TRANSLATIONS = {
     UsdGeom.XformOp.TypeTranslateY,
     UsdGeom.XformOp.TypeTranslateZ,
 }
-_BETWEEN = 0.382  # where between two samples transforms are tested for bends; halfway, two whole turns look like none
-_ROUNDING = 1e-6  # of transforms that USD interpolates in single precision
 
 
 class MeshTransforms:
@@ -43,7 +42,7 @@ class MeshTransforms:
         self.may_turn = any(kind not in TRANSLATIONS for kind in varying) or bool(instancer and instancer.may_turn)
         self._cache = UsdGeom.XformCache()
         # Between samples as well, because a whole turn ends where it began.
-        between = [start + _BETWEEN * (end - start) for start, end in pairwise(self.times)]
+        between = [start + BETWEEN * (end - start) for start, end in pairwise(self.times)]
         codes = [Usd.TimeCode.EarliestTime(), *map(Usd.TimeCode, sorted([*self.times, *between]))]
         first, were_there = (values.copy() for values in self.read(instance, codes[0]))
         # Some writers sample a transform at every time although it never changes.
@@ -82,14 +81,9 @@ class MeshTransforms:
     def bend(self, instance: Instance | None, start: float, end: float) -> np.ndarray:
         """Returns whether the transform of each instance leaves the straight path from one sample to the next."""
         if (start, end) not in self._bent:
-            codes = Usd.TimeCode(start), Usd.TimeCode(start + _BETWEEN * (end - start)), Usd.TimeCode.PreTime(end)
-            (first, *_), (between, *_), (last, *_) = found = [self.read(instance, code) for code in codes]
-            off = np.abs(between - (first + _BETWEEN * (last - first)))
-            size = np.maximum(np.abs(first), np.abs(last))
-            bent = np.zeros(len(first), dtype=bool)
-            for rows in (slice(0, 3), slice(3, 4)):
-                bent |= off[:, rows].max(axis=(1, 2)) > _ROUNDING * size[:, rows].max(axis=(1, 2))
-            self._bent[start, end] = bent & np.all([are_there for _, are_there in found], axis=0)
+            codes = Usd.TimeCode(start), Usd.TimeCode.PreTime(end), Usd.TimeCode(start + BETWEEN * (end - start))
+            transforms, are_there = zip(*(self.read(instance, code) for code in codes), strict=True)
+            self._bent[start, end] = are_bent(*transforms) & np.all(are_there, axis=0)
         return self._bent[start, end]
 
     def scales(self, instance: Instance | None, times: list[Usd.TimeCode]) -> list[float]:

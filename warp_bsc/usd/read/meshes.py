@@ -13,7 +13,7 @@ from ..._sorted_keys import distinct
 from .instancers import is_shown, visibility_times
 from .mesh_prims import MeshPrim
 from .mesh_transforms import MeshTransforms
-from .samples import as_time_code, sample_times
+from .samples import sample_times
 from .shapes import MeshPolygons, Polygons, ShapePolygons, TetPolygons, is_shape
 from .skinning import Skin
 from .strands import Strands, is_strands
@@ -81,7 +81,7 @@ class UsdMesh:
         self.has_skeleton = bool(skin and skin.skeleton)
         self.instanced_prim = found.instanced_prim
         self._last_points: dict[tuple, np.ndarray] = {}  # these two are shared by all instances
-        self._last_triangles: dict[tuple, tuple[np.ndarray, np.ndarray, int]] = {}
+        self._last_triangles: dict[tuple, tuple[np.ndarray, np.ndarray]] = {}
 
         root, breaks = (instance.root, instance.instancer.break_times) if instance else (None, set())
         breaks = breaks | visibility_times(prim, root)
@@ -194,7 +194,7 @@ class UsdMesh:
             return True
         try:
             points = self.read_points(time)
-            triangles, _, _ = self.read_triangles(time, points)
+            triangles, _ = self.read_triangles(time, points)
             self.read_strands([time], len(points))
             used = np.arange(len(points)) if self.is_strands else distinct(triangles)
             self.read_positions(time, used=used, point_count=len(points), dtype=points.dtype)
@@ -341,7 +341,7 @@ class UsdMesh:
                 return None
             return points @ transforms[:, :3, :3] + transforms[:, 3:, :3]
 
-    def read_triangles(self, time: float, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
+    def read_triangles(self, time: float, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns the polygons without the holes, as triangles that turn counterclockwise seen from outside.
 
         Args:
@@ -349,14 +349,14 @@ class UsdMesh:
             points: Points by which concave polygons are cut, shape [point_count, 3].
 
         Returns:
-            The triangles' points, shape [triangle_count, 3], the polygon that each is a part of, shape
-            [triangle_count], and the number of polygons, holes included.
+            The triangles' points, shape [triangle_count, 3], and the polygon that each is a part of, shape
+            [triangle_count].
 
         Raises:
             UnreadableError: If the faces are broken, or there are none.
         """
         if self._strands:
-            return np.zeros((0, 3), dtype=np.int64), np.zeros(0, dtype=np.int64), 0
+            return np.zeros((0, 3), dtype=np.int64), np.zeros(0, dtype=np.int64)
         with reading(self._where, self.name, time):
             is_mirrored = bool(np.linalg.det(self._transform(time)[:3, :3]) < 0)
             code = self.time_code(time, False)
@@ -410,13 +410,10 @@ class UsdMesh:
     def _scales(self, times: list[float]) -> list[float]:
         return self.transforms.scales(self.instance, [self.time_code(time, False) for time in times])
 
-    def _find_triangles(self, code, points, is_mirrored) -> tuple[np.ndarray, np.ndarray, int]:
+    def _find_triangles(self, code, points, is_mirrored) -> tuple[np.ndarray, np.ndarray]:
         """Returns the result of :meth:`read_triangles`."""
-        topology = self._topologies.read(code)
-        triangles, polygons = topology.triangles(points)
-        if self._is_left_handed != is_mirrored:
-            triangles = triangles[:, ::-1]
-        return triangles, polygons, len(topology.counts)
+        triangles, polygons = self._topologies.read(code).triangles(points)
+        return triangles[:, ::-1] if self._is_left_handed != is_mirrored else triangles, polygons
 
     @property
     def _is_left_handed(self) -> bool:
@@ -426,7 +423,9 @@ class UsdMesh:
         """Returns the mesh's own time code for a time of the scene, or for the moment just before it."""
         first, last = self._own_times.get(time, (time, time))
         # Reading the moment before a time takes twice as long, as USD interpolates from the previous sample.
-        return as_time_code(first if before else last, before=before and (self.may_jump or time in self.states))
+        if before and (self.may_jump or time in self.states):
+            return Usd.TimeCode.PreTime(first)
+        return Usd.TimeCode(first if before else last)
 
     def _transform(self, time, *, before=False) -> np.ndarray:
         """Returns the matrix that transforms points, as rows, to world space, shape [4, 4]."""

@@ -46,11 +46,6 @@ def may_jump(attributes: Iterable[Usd.Attribute]) -> bool:
     return False
 
 
-def as_time_code(time: float, *, before: bool) -> Usd.TimeCode:
-    """Returns the time code of a time, or of the moment just before it, where a jumping value is still the old one."""
-    return Usd.TimeCode.PreTime(time) if before else Usd.TimeCode(time)
-
-
 def _spline_times(attribute) -> set[float]:
     """Returns the times at which a spline is sampled."""
     spline, stage = attribute.GetSpline(), attribute.GetStage()

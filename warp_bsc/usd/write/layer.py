@@ -12,13 +12,6 @@ from ..scene import Scene
 from .layer_writer import AddSample, new_layer
 
 
-def unused_path(scene: Scene, path: str) -> str:
-    """Returns a path at which the scene has no prim: a given one, with underscores appended if necessary."""
-    while scene.stage.GetPrimAtPath(path):
-        path += "_"
-    return path
-
-
 class SceneLayer:
     """A layer over a scene, whose sublayer is the scene."""
 

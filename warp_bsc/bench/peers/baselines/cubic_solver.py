@@ -37,18 +37,13 @@ from typing import Any
 import warp as wp
 
 from ....kernels.culling import edge_edge_boxes_apart, vertex_face_boxes_apart
-from ....kernels.signs import FREE, HIT
+from ....kernels.signs import FREE, HALF, HIT, ONE, THREE, TWO, ZERO
 
 COPLANAR = wp.constant(wp.float64(1.0e-9))
 """Largest value of the cubic that counts as zero, as a share of the sum of its coefficients' absolute values."""
 DISTANCE = wp.constant(wp.float64(1.0e-6))
 """Distance at which features collide, in the unit of the coordinates: a micrometre, if that is a metre."""
 
-_ZERO = wp.constant(wp.float64(0.0))
-_HALF = wp.constant(wp.float64(0.5))
-_ONE = wp.constant(wp.float64(1.0))
-_TWO = wp.constant(wp.float64(2.0))
-_THREE = wp.constant(wp.float64(3.0))
 _NEWTON_STEPS = wp.constant(40)
 _NEWTON_END = wp.constant(wp.float64(1.0e-10))
 
@@ -110,15 +105,15 @@ def _extrema(c: wp.vec4d) -> wp.vec2d:
 
     The roots of 3 c3 t^2 + 2 c2 t + c1 without cancellation: one as a quotient, the other by the product of both.
     """
-    first = _ONE
-    second = _ONE
-    discriminant = c[2] * c[2] - _THREE * c[3] * c[1]
-    if discriminant > _ZERO:
-        q = -(c[2] + wp.where(c[2] < _ZERO, -wp.sqrt(discriminant), wp.sqrt(discriminant)))
-        a = q / (_THREE * c[3])
+    first = ONE
+    second = ONE
+    discriminant = c[2] * c[2] - THREE * c[3] * c[1]
+    if discriminant > ZERO:
+        q = -(c[2] + wp.where(c[2] < ZERO, -wp.sqrt(discriminant), wp.sqrt(discriminant)))
+        a = q / (THREE * c[3])
         b = c[1] / q
-        first = wp.where(a > _ZERO and a < _ONE, a, _ONE)
-        second = wp.where(b > _ZERO and b < _ONE, b, _ONE)
+        first = wp.where(a > ZERO and a < ONE, a, ONE)
+        second = wp.where(b > ZERO and b < ONE, b, ONE)
     return wp.vec2d(wp.min(first, second), wp.max(first, second))
 
 
@@ -130,15 +125,15 @@ def _root(c: wp.vec4d, start: wp.float64, end: wp.float64, at_start: wp.float64,
     t = start + (end - start) * (at_start / (at_start - at_end))
     for _ in range(_NEWTON_STEPS):
         value = _value(c, t)
-        slope = (_THREE * c[3] * t + _TWO * c[2]) * t + c[1]
-        if (value > _ZERO) == (at_start > _ZERO):
+        slope = (THREE * c[3] * t + TWO * c[2]) * t + c[1]
+        if (value > ZERO) == (at_start > ZERO):
             low = t
         else:
             high = t
         step = value / slope
         t -= step
         if not (low <= t <= high):
-            step = _HALF * (high - low)
+            step = HALF * (high - low)
             t = low + step
         if wp.abs(step) <= _NEWTON_END:
             break
@@ -149,9 +144,9 @@ def _root(c: wp.vec4d, start: wp.float64, end: wp.float64, at_start: wp.float64,
 def _to_segment(w: wp.vec3d, u: wp.vec3d) -> wp.float64:
     """Returns the squared distance of a point w from the segment from the origin to u."""
     uu = wp.dot(u, u)
-    s = _ZERO
-    if uu > _ZERO:
-        s = wp.clamp(wp.dot(w, u) / uu, _ZERO, _ONE)
+    s = ZERO
+    if uu > ZERO:
+        s = wp.clamp(wp.dot(w, u) / uu, ZERO, ONE)
     return wp.length_sq(w - s * u)
 
 
@@ -172,7 +167,7 @@ def _close(vertex_face: bool, r: Relative, t: wp.float64) -> bool:
     gamma = vw * uu - uw * uv  # edges have the other direction of v
     other = wp.where(vertex_face, gamma, -gamma)
     most = wp.where(vertex_face, beta + gamma, wp.max(beta, -gamma))
-    if determinant > _ZERO and beta >= _ZERO and other >= _ZERO and most <= determinant:
+    if determinant > ZERO and beta >= ZERO and other >= ZERO and most <= determinant:
         return wp.length_sq(w - (beta * u + gamma * v) / determinant) <= limit
     if vertex_face:
         return _to_segment(w, u) <= limit or _to_segment(w, v) <= limit or _to_segment(w - u, v - u) <= limit
@@ -189,17 +184,17 @@ def _solve(vertex_face: bool, r: Relative) -> int:
     c = _cubic(r)
     zero = COPLANAR * (wp.abs(c[0]) + wp.abs(c[1]) + wp.abs(c[2]) + wp.abs(c[3]))
     turns = _extrema(c)
-    start = _ZERO
+    start = ZERO
     at_start = c[0]
     if wp.abs(at_start) <= zero and _close(vertex_face, r, start):
         return HIT
     for i in range(3):
-        end = wp.where(i == 0, turns[0], wp.where(i == 1, turns[1], _ONE))
+        end = wp.where(i == 0, turns[0], wp.where(i == 1, turns[1], ONE))
         if end > start:
             at_end = _value(c, end)
             t = end
             found = wp.abs(at_end) <= zero
-            if (at_start < _ZERO and at_end > _ZERO) or (at_start > _ZERO and at_end < _ZERO):
+            if (at_start < ZERO and at_end > ZERO) or (at_start > ZERO and at_end < ZERO):
                 t = _root(c, start, end, at_start, at_end)
                 found = True
             if found and _close(vertex_face, r, t):

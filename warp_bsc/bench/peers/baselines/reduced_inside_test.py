@@ -11,24 +11,19 @@ import warp as wp
 
 from ....kernels.classification import classify_with
 from ....kernels.polynomials import VERTEX_FACE, Coplanarity, InsideTests, Motion, cross_middle
-from ....kernels.signs import FREE, certified_sign_cubic
-
-_HALF = wp.constant(wp.float64(0.5))
-_THREE = wp.constant(wp.float64(3.0))
-_FOUR = wp.constant(wp.float64(4.0))
-_TWO = wp.constant(wp.float64(2.0))
+from ....kernels.signs import FOUR, FREE, HALF, THREE, TWO, certified_sign_cubic
 
 
 @wp.func
 def _reduce(k: wp.vec4d, l0: wp.float64, l1: wp.float64, l2: wp.float64, l3: wp.float64, l4: wp.float64) -> wp.vec3d:
     """Returns P from Y and a quartic with Bernstein coefficients l (supplement 1, equations 20 and 23)."""
-    s0 = _FOUR * l1 * k[0] - l0 * (k[0] + _THREE * k[1])
-    s1 = _TWO * l2 * k[0] - l0 * (k[1] + k[2])
-    s2 = (_FOUR * l3 * k[0] - l0 * (_THREE * k[2] + k[3])) / _THREE
+    s0 = FOUR * l1 * k[0] - l0 * (k[0] + THREE * k[1])
+    s1 = TWO * l2 * k[0] - l0 * (k[1] + k[2])
+    s2 = (FOUR * l3 * k[0] - l0 * (THREE * k[2] + k[3])) / THREE
     s3 = l4 * k[0] - l0 * k[3]
     return wp.vec3d(
-        _THREE * (s1 * k[0] - s0 * k[1]),
-        _THREE * _HALF * (s2 * k[0] - s0 * k[2]),
+        THREE * (s1 * k[0] - s0 * k[1]),
+        THREE * HALF * (s2 * k[0] - s0 * k[2]),
         s3 * k[0] - s0 * k[3],
     )
 
@@ -42,9 +37,9 @@ def _reduced_test(y: Coplanarity, sign: wp.float64, x0: wp.vec3d, x1: wp.vec3d, 
     return _reduce(
         y.k,
         wp.dot(m0, y.n0),
-        _HALF * (wp.dot(m0, y.nh) + wp.dot(mh, y.n0)),
-        (wp.dot(m0, y.n1) + _FOUR * wp.dot(mh, y.nh) + wp.dot(m1, y.n0)) / wp.float64(6.0),
-        _HALF * (wp.dot(mh, y.n1) + wp.dot(m1, y.nh)),
+        HALF * (wp.dot(m0, y.nh) + wp.dot(mh, y.n0)),
+        (wp.dot(m0, y.n1) + FOUR * wp.dot(mh, y.nh) + wp.dot(m1, y.n0)) / wp.float64(6.0),
+        HALF * (wp.dot(mh, y.n1) + wp.dot(m1, y.nh)),
         wp.dot(m1, y.n1),
     )
 

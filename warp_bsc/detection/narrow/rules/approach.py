@@ -16,7 +16,7 @@ from ....kernels.ccd import impact_at_distance
 from ....kernels.min_distance import clears_at_once, closest_at
 from ....kernels.motion import doubles, motion_and_distance, query_at
 from ....kernels.pairs import ABOVE_SUM, distance_of_corners, ends_of, firsts_of
-from ....kernels.signs import FREE, ROUNDOFF
+from ....kernels.signs import FREE, ROUNDOFF, TWO, ZERO
 from ....kernels.time_of_impact import Impact
 from ...mesh import CollisionMesh
 from ...run.launch import made_once
@@ -33,8 +33,6 @@ The search certifies it for a pair at rest, also where that is pressed from both
 """
 SHARE_ON_ARCS = wp.constant(wp.float64(1.0 - 2.0**-6))
 """Share of its minimum distance that a pair keeps on arcs, between the start and the end of the step."""
-_ZERO = wp.constant(wp.float64(0.0))
-_TWO = wp.constant(wp.float64(2.0))
 
 _RINGS = 1
 
@@ -88,9 +86,9 @@ def distances_of_pair(
     The first is a lower bound; it is 0 if the elements may touch. The second is less, unless the first is 0.
     """
     found, error = distance_at(kind, a, b, c, d)
-    start = wp.max(found - _TWO * error, _ZERO)
+    start = wp.max(found - TWO * error, ZERO)
     if are_within_rings(corners, firsts_of(kind), distances.rings):
-        return start, _ZERO
+        return start, ZERO
     return start, wp.min(distance_of_corners(kind, corners, distances.radius), KEPT * start)
 
 
@@ -180,7 +178,7 @@ def _rule(turning: bool) -> PairRule:
             if start < reach:
                 is_contact = True
                 motion, _scaled = motion_and_distance(kind, a0, b0, c0, d0, a1, b1, c1, d1, reach, ROUNDOFF)
-                coordinates, normal = closest_at(kind, motion, _ZERO)
+                coordinates, normal = closest_at(kind, motion, ZERO)
                 result.coordinates = coordinates
                 result.normal = normal
             elif not wp.static(turning) or result.status == FREE:

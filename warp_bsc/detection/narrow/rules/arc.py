@@ -15,17 +15,12 @@ from ....kernels.motion import motion_and_distance, query_at
 from ....kernels.pairs import distance_of_corners, ends_of, vertices_of_pair
 from ....kernels.pipeline.batch_culling import BATCH
 from ....kernels.pipeline.queues import filled_entries, take_slots
-from ....kernels.signs import FREE, ROUNDOFF
+from ....kernels.signs import FREE, ONE, ROUNDOFF, ZERO
 from ...run.launch import launch_over, made_once
 from ...run.phase_timer import PhaseTimer
 from ...run.settings import NO_FUSED_OPERATIONS, Count
 from ..narrow_phase import Phases, buffers_of, launch_culls, launch_decisions
 from ..pair_kernels import PairBuffers, PairRule, add_contact
-
-_QUEUED = wp.constant(int(Count.QUEUED))
-_SURVIVORS = wp.constant(int(Count.SURVIVORS))
-_ONE = wp.constant(wp.float64(1.0))
-_ZERO = wp.constant(wp.float64(0.0))
 
 
 def allocate_arcs(body: np.ndarray, bodies: int, device: wp.Device, *, tolerance: float = 0.0) -> Arcs:
@@ -50,7 +45,7 @@ def allocate_arcs(body: np.ndarray, bodies: int, device: wp.Device, *, tolerance
 @wp.func
 def bound_arc(arcs: Arcs, vertex: int, x0: wp.vec3d, x1: wp.vec3d):
     """Writes how far a vertex is from its chord, and whether it turns, from its positions at both ends of the step."""
-    deviation = _ZERO
+    deviation = ZERO
     bounds = wp.vec3d()
     if wp.isfinite(x0) and wp.isfinite(x1):
         body = arcs.body[vertex]
@@ -60,8 +55,8 @@ def bound_arc(arcs: Arcs, vertex: int, x0: wp.vec3d, x1: wp.vec3d):
             centre = arcs.centre[body]
             turn = arcs.turn[body]
         bounds = arc_bounds(x0, x1, centre, turn)
-        if wp.length_sq(turn) > _ZERO:
-            deviation = sagitta_of_part(bounds, _ONE) + bounds[2]
+        if wp.length_sq(turn) > ZERO:
+            deviation = sagitta_of_part(bounds, ONE) + bounds[2]
             arcs.turning[0] = 1
     arcs.bounds[vertex] = bounds
     arcs.deviation[vertex] = deviation
@@ -93,7 +88,7 @@ def _clears(options: Options, kind: int, v: wp.vec4i, x0: wp.array[Any], x1: wp.
 
 @wp.func
 def _decide(options: Options, kind: int, v: wp.vec4i, x0: wp.array[Any], x1: wp.array[Any]):
-    result = impact_on_arcs(kind, v, query_at(x0, x1, v), options.arcs, _ZERO)
+    result = impact_on_arcs(kind, v, query_at(x0, x1, v), options.arcs, ZERO)
     return result, result.status != FREE
 
 
@@ -117,7 +112,7 @@ def _batch_kernel(dtype: type) -> wp.Kernel:
         buffers: PairBuffers,
     ):
         i = BATCH * (first + wp.tid())
-        end = wp.min(i + BATCH, filled_entries(buffers.queue, buffers.counts, _QUEUED))
+        end = wp.min(i + BATCH, filled_entries(buffers.queue, buffers.counts, Count.QUEUED))
         begin = i
         while i < end and buffers.queue[i][0] >= 0:
             pair = buffers.queue[i]
@@ -126,7 +121,7 @@ def _batch_kernel(dtype: type) -> wp.Kernel:
             if is_contact:
                 add_contact(pair, result, buffers)
             i += 1
-        take_slots(buffers.counts, _SURVIVORS, i - begin)
+        take_slots(buffers.counts, Count.SURVIVORS, i - begin)
 
     return decide_arc_batches
 

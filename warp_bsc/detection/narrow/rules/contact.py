@@ -36,9 +36,6 @@ from ..pair_kernels import (
     write_impact,
 )
 
-_CONTACTS = wp.constant(int(Count.CONTACTS))
-_FOR_EXACT = wp.constant(int(Count.FOR_EXACT))
-
 
 @wp.struct
 class Options:
@@ -100,7 +97,7 @@ def _finish(i: int, status: int, timed: bool, buffers: PairBuffers):
         return
     count_found(status, buffers)
     if status == UNSURE or (timed and not buffers.contacts.within_tolerance[i]):
-        buffers.for_exact[wp.int32(take_slot(buffers.counts, _FOR_EXACT))] = i
+        buffers.for_exact[wp.int32(take_slot(buffers.counts, Count.FOR_EXACT))] = i
 
 
 @made_once
@@ -123,7 +120,7 @@ def _impact_kernel(dtype: type) -> wp.Kernel:
         other: PairBuffers,
     ):
         kind, i, v = entry_of_two(
-            first + wp.tid(), kinds, one.contacts.pairs, other.contacts.pairs, one, other, _CONTACTS
+            first + wp.tid(), kinds, one.contacts.pairs, other.contacts.pairs, one, other, Count.CONTACTS
         )
         if v[0] < 0:
             return

@@ -28,10 +28,6 @@ _ADVANCING, _SUBDIVIDING = 384, 256
 """Threads of a multiprocessor that search, limited by their registers, each for one pair after another. On a CPU, each
 thread searches for one pair."""
 
-_SURVIVORS = wp.constant(int(Count.SURVIVORS))
-_FOR_EXACT = wp.constant(int(Count.FOR_EXACT))
-_SUBDIVIDED = wp.constant(int(Count.SUBDIVIDED))
-
 
 @wp.struct
 class Options:
@@ -89,7 +85,7 @@ def _decide_contact(k: int, kind: int, at: _PairSearch, timed: bool, buffers: Pa
     if result.status != FREE:
         count_found(result.status, buffers)
     if result.status == UNSURE or (timed and result.status == HIT and result.within_tolerance == 0):
-        take_slot(buffers.counts, _FOR_EXACT)
+        take_slot(buffers.counts, Count.FOR_EXACT)
     if k >= 0:
         write_impact(k, result, buffers)
         write_decision(k, result.status, buffers)
@@ -140,7 +136,7 @@ def _search_kernels(dtype: type) -> tuple[wp.Kernel, wp.Kernel]:
         # in and out
         buffers: PairBuffers,
     ):
-        filled = wp.uint32(filled_entries(buffers.survivors, buffers.counts, _SURVIVORS))
+        filled = wp.uint32(filled_entries(buffers.survivors, buffers.counts, Count.SURVIVORS))
         i = wp.uint32(first + wp.tid())
         at = _PairSearch()
         at.search.ended = True
@@ -153,7 +149,7 @@ def _search_kernels(dtype: type) -> tuple[wp.Kernel, wp.Kernel]:
                 if not at.search.given_up:
                     _decide_contact(k, kind, at, options.timed, buffers)
                 elif k >= 0:
-                    buffers.for_exact[wp.int32(take_slot(buffers.counts, _SUBDIVIDED))] = k
+                    buffers.for_exact[wp.int32(take_slot(buffers.counts, Count.SUBDIVIDED))] = k
             if at.search.ended:
                 i += threads
 
@@ -170,7 +166,7 @@ def _search_kernels(dtype: type) -> tuple[wp.Kernel, wp.Kernel]:
         # in and out
         buffers: PairBuffers,
     ):
-        filled = wp.uint32(buffers.counts[_SUBDIVIDED])
+        filled = wp.uint32(buffers.counts[Count.SUBDIVIDED])
         i = wp.uint32(first + wp.tid())
         at = _PairSearch()
         at.search.ended = True
