@@ -22,6 +22,7 @@ from newton_scenes import (
 
 import warp_bsc as bsc
 from warp_bsc.response.state.structs import DIVIDED, PROJECTED
+from warp_bsc.response.tuning import MAX_ITERATIONS, MAX_STUCK_ITERATIONS
 
 
 def check_rest(rollout, dt, steps):
@@ -212,6 +213,63 @@ def test_plates_that_leave_no_room(gaps, iterations, device):
         assert rollout.positions[pressed:].tobytes() == wanted[pressed:].tobytes()
     assert certified[:2] == [True, True] and not certified[2]
     assert certified[-2:] == [True, True]
+
+
+def press_cloth(device, speed, **options):
+    """Plates press a sheet through the ground by turns, then a crumpled patch is shot at another sheet.
+
+    Returns the rollout, and of each step the number of frozen vertices and that of iterations.
+    """
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    builder.add_ground_plane()
+    add_patch(builder, 3, 0.04, (0.0, 0.0, 0.002))
+    plates = slice(builder.particle_count, builder.particle_count + 6 * 9)
+    for i in range(6):
+        add_patch(builder, 2, 0.08, (0.013, 0.007, 0.005 + 0.01 * i))
+    builder.particle_mass[plates] = [0.0] * 54
+    add_patch(builder, 6, 0.05, (1.0, 0.0, 0.5), fixed=True)
+    add_patch(builder, 6, 0.03, (1.011, 0.017, 0.55))
+    builder.color()
+    model = builder.finalize(device=device)
+
+    def lower(state):
+        write_rows(state.particle_q, plates, state.particle_q.numpy()[plates] - np.float32([0.0, 0.0, speed * DT]))
+
+    rollout = Rollout(model, bsc.SolverCCD(Changed(model, lower), **options))
+    frozen, iterations = [], []
+    for step in range(11):
+        if step == 8:
+            random = np.random.default_rng(0).standard_normal((49, 3)) * (20.0, 20.0, 60.0) - (0.0, 0.0, 100.0)
+            write_rows(rollout.states[0].particle_qd, slice(-49, None), random)
+        rollout.step()
+        report = rollout.solver.report
+        assert len(rollout.new_collisions) == report.remaining and report.certified == (report.remaining == 0)
+        frozen.append(report.frozen)
+        iterations.append(report.iterations)
+    return rollout, np.array(frozen), np.array(iterations)
+
+
+def test_cloth_that_is_pressed_through_a_plane(device):
+    """Its steps after the first take few iterations, what collides elsewhere then all that it needs."""
+    through = r"pass through shape 0 \('ground_plane'\):.* mask = np.full\(1, -1\) and mask\[\[0\]\] = 0"
+    with pytest.warns(UserWarning, match=through):
+        pressed, frozen, iterations = press_cloth(device, 2.0)
+    stuck = iterations[frozen > 0]
+    assert len(stuck) > 4 and not frozen[8:].any()
+    assert MAX_ITERATIONS < stuck[0] < MAX_ITERATIONS + 6 and stuck[1:].max() < MAX_STUCK_ITERATIONS + 6, iterations
+    calm, frozen, iterations_of_calm = press_cloth(device, 0.0)
+    assert not frozen.any() and iterations[8:].tolist() == iterations_of_calm[8:].tolist()
+    assert iterations[8:].max() > 2 * MAX_STUCK_ITERATIONS, iterations
+    assert pressed.positions[-98:].tobytes() == calm.positions[-98:].tobytes()
+
+
+def test_a_filter_lets_cloth_be_pressed_through_a_plane(device):
+    """It is the one that the warning of the test before names."""
+    mask = np.full(1, -1)
+    mask[[0]] = 0
+    pressed, frozen, iterations = press_cloth(device, 2.0, collision_filter=bsc.CollisionFilter(shape_mask=mask))
+    assert pressed.solver.report.totals.uncertified_steps == 0 and not frozen.any()
+    assert iterations[:8].max() <= MAX_STUCK_ITERATIONS and pressed.positions[:16, 2].max() < 0.0
 
 
 def test_shapes_may_pass_through_each_other(device):

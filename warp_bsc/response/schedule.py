@@ -15,9 +15,12 @@ Where a contact has no dividing plane, its paths are truncated. In the iteration
 When does a step end? When a detection finds no contact and no pair that is too near, or when freezing changes nothing
 more. It ends: vertices that stood apart at the start and stand still do not collide.
 
-When is a vertex frozen, that is, kept at its start? If it still collides in the last row. One whose prediction is not
-finite stays at its start as well, and is counted apart. Where a queue is too small, which cannot grow in a CUDA graph,
-:mod:`.contacts.search` finds contacts without queues, and all worlds go to the third row.
+When is a vertex frozen, that is, kept at its start? If it still collides in the last row, to which a world goes early
+if a division moves nothing in it: the next one would find the same contacts. One whose prediction is not finite stays
+at its start as well, and is counted apart. Where a vertex collides that was frozen in one of the last ``STUCK_STEPS``
+steps, its world divides from ``n = MAX_STUCK_ITERATIONS`` on: a program may force it through something. Where a queue
+is too small, which cannot grow in a CUDA graph, :mod:`.contacts.search` finds contacts without queues, and all worlds
+go to the third row.
 
 What makes a step uncertified? Contacts that remain, or start positions that are not finite, see :func:`decide`;
 predictions that are not finite; contacts on arcs; tetrahedra that still invert where that is prevented; and an end that
@@ -41,7 +44,7 @@ from ..kernels.pipeline.queues import has_overflowed
 from .state.certificate import certify
 from .state.status import Detection, Loop, Result, SolveStatus, clear_detection
 from .state.structs import Step
-from .tuning import MAX_CUTS
+from .tuning import MAX_CUTS, MAX_STUCK_ITERATIONS
 
 wp.set_module_options({"enable_backward": False})
 
@@ -57,7 +60,7 @@ _LARGEST_COUNT = wp.constant(wp.int64(2**31 - 1))
 @wp.func
 def divides_after(status: SolveStatus, world: int, iteration: int) -> bool:
     """Returns whether contacts found after ``iteration`` iterations are divided, and not projected."""
-    if iteration >= status.max_iterations:
+    if iteration >= status.max_iterations or (iteration >= MAX_STUCK_ITERATIONS and status.is_stuck[world] == 1):
         return True
     return iteration >= status.max_slow_iterations and status.is_fast[world] == 0
 
@@ -89,9 +92,16 @@ def divides_now(status: SolveStatus, world: int) -> bool:
 
 
 @wp.func
-def is_freezing(status: SolveStatus) -> bool:
-    """Returns whether this iteration freezes what still collides."""
-    return status.loop[Loop.ITERATION] > status.max_iterations + status.max_divisions
+def is_freezing(status: SolveStatus, world: int) -> bool:
+    """Returns whether this iteration freezes what still collides in a world."""
+    return status.idle[world] > 1 or status.loop[Loop.ITERATION] > status.max_iterations + status.max_divisions
+
+
+@wp.func
+def note_moved(status: SolveStatus, world: int):
+    """Notes that this division moves something in a world."""
+    if not is_freezing(status, world):
+        status.idle[world] = 0
 
 
 @wp.func
@@ -113,6 +123,8 @@ def widened(separation: wp.float64, status: SolveStatus) -> wp.float64:
 def count_contact(status: SolveStatus, world: int):
     """Counts a contact that a detection found."""
     wp.atomic_add(status.detection, int(Detection.HITS), 1)
+    if not is_freezing(status, world):
+        wp.atomic_add(status.detection, int(Detection.OPEN), 1)
     status.contact_iteration[world] = status.loop[Loop.ITERATION]
     if status.of_worlds.found:
         wp.atomic_add(status.of_worlds.found, world, 1)
@@ -185,8 +197,10 @@ def decide(step: Step, counts: wp.array[wp.int64], capacities: wp.array[wp.int64
     loop[Loop.SEARCHING] = 0
     hits = detection[Detection.HITS]
     inverting = results[Result.INVERTING]
-    finished = hits == 0 and detection[Detection.TOO_NEAR] == 0 and inverting == 0
-    stuck = is_freezing(status) and loop[Loop.NEWLY_FROZEN] == 0
+    finished = detection[Detection.OPEN] == 0 and detection[Detection.TOO_NEAR] == 0 and inverting == 0
+    finished = finished and (hits == 0 or loop[Loop.NEWLY_FROZEN] == 0)
+    is_last = loop[Loop.ITERATION] > status.max_iterations + status.max_divisions
+    stuck = is_last and loop[Loop.NEWLY_FROZEN] == 0
     results[Result.REMAINING] = hits
     results[Result.EXCLUDED] = detection[Detection.EXCLUDED]
     results[Result.BODY_CONTACTS] = detection[Detection.OF_BODIES]
@@ -216,6 +230,8 @@ def begin_prevention(status: SolveStatus):
         after = wp.where(results[Result.REMAINING] > 0, status.max_divisions, 0)
         loop[Loop.ITERATION] = status.max_iterations + after + 1
         loop[Loop.ACTIVE] = 1
+        for world in range(status.idle.shape[0]):
+            status.idle[world] = 0
         results[Result.ITERATIONS] = results[Result.ITERATIONS] + 1
 
 

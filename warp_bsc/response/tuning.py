@@ -128,6 +128,10 @@ THREADS = 2048
 # iterations and sweeps
 MAX_ITERATIONS = 40
 """Iterations of detect and project, after which vertices that still collide are divided."""
+MAX_STUCK_ITERATIONS = wp.constant(4)
+"""The same in worlds in which a vertex collides that was frozen in one of the last ``STUCK_STEPS`` steps."""
+STUCK_STEPS = wp.constant(16)
+"""Steps for which a vertex that was frozen is expected to be so again: rollers catch rows of cloth by turns."""
 MAX_SLOW_ITERATIONS = 1
 """The same in worlds without fast contacts: division hardly moves slow elements, and costs no sweeps."""
 MAX_DIVISIONS = 32

@@ -12,7 +12,7 @@ from ...kernels.signs import FREE
 from ..schedule import count_contact, count_filtered, divides_after, widened
 from ..state.planes import MovingPlanes, is_filtered_by_plane, signed_distance, time_of_entry
 from ..state.status import Detection, Loop, Result, SolveStatus
-from ..state.structs import ContactKind, DividingPlanes, Motion, Pace, Step, Vertices, body_of
+from ..state.structs import ContactKind, DividingPlanes, Motion, Pace, Step, body_of
 from ..state.vectors import ONE, ZERO, relative
 from ..tuning import PLANE_APPROACH, PLANE_DEPTH, PLANE_MARGIN
 from . import constraints, rules
@@ -118,6 +118,15 @@ def distances_from_plane(motion: Motion, planes: MovingPlanes, i: int, vertex: i
     return wp.max(kept, ZERO), motion.distances.reach
 
 
+@wp.func
+def mark_changed(step: Step, status: SolveStatus, corners: wp.vec4i):
+    """Marks the vertices of a contact for the next detection; a first one notes worlds where one was frozen lately."""
+    for j in range(4):
+        step.vertices.changed[corners[j]] = 1
+        if status.loop[Loop.ITERATION] == 0 and step.vertices.frozen_lately[corners[j]] > 0:
+            status.is_stuck[step.motion.world[corners[j]]] = 1
+
+
 @wp.kernel
 def collect_penetrations(step: Step, planes: MovingPlanes, ahead: bool, dividing: DividingPlanes, status: SolveStatus):
     """Adds constraints for vertices that may have entered solids; after the last projection, dividing planes too.
@@ -162,7 +171,7 @@ def collect_penetrations(step: Step, planes: MovingPlanes, ahead: bool, dividing
                 wp.atomic_add(status.of_worlds.hits, world, wp.where(near, 0, 1))
         else:
             count_contact(status, world)
-            vertices.changed[vertex] = 1
+            mark_changed(step, status, wp.vec4i(vertex))
             if status.loop[Loop.ITERATION] == 0 and body_of(motion, vertex) >= 0:
                 status.is_fast[world] = 1  # as between elements, see _collect_contact
         plane = planes.end[i]
@@ -191,13 +200,6 @@ def collect_penetrations(step: Step, planes: MovingPlanes, ahead: bool, dividing
         added.plane = i
         added.pace = Pace.SLOW
         constraints.add_constraint(step, added)
-
-
-@wp.func
-def mark_changed(vertices: Vertices, corners: wp.vec4i):
-    """Marks the vertices of a contact, so that the next detection finds it again if it is still there."""
-    for j in range(4):
-        vertices.changed[corners[j]] = 1
 
 
 @wp.func
@@ -233,7 +235,7 @@ def _collect_contact(
         wp.atomic_add(status.detection, int(Detection.EXCLUDED), wp.where(near, 0, 1))
     if found == ContactClass.OF_BODIES:
         wp.atomic_add(status.detection, int(Detection.OF_BODIES), 1)
-        mark_changed(vertices, corners)
+        mark_changed(step, status, corners)
     if found != ContactClass.OURS:
         return
     iteration = status.loop[Loop.ITERATION]
@@ -244,7 +246,7 @@ def _collect_contact(
     added.kind = constraints.kind_of_contact(kind)
     if not near:
         count_contact(status, world)
-        mark_changed(vertices, corners)
+        mark_changed(step, status, corners)
         if iteration == 0:
             # dividing planes do not follow bodies: they would stop one that takes along what it pushes
             moves = added.pace == Pace.FAST or rules.are_on_body(motion, corners)

@@ -66,12 +66,12 @@ def _resolve(
         wp.atomic_add(arguments.status.detection, int(Detection.EXCLUDED), 1)
     if found == ContactClass.OF_BODIES:
         wp.atomic_add(arguments.status.detection, int(Detection.OF_BODIES), 1)
-        mark_changed(arguments.step.vertices, corners)
+        mark_changed(arguments.step, arguments.status, corners)
     if found != ContactClass.OURS:
         return
     count_contact(arguments.status, arguments.step.motion.world[corners[0]])
     add_dividing_plane(arguments.step, corners, kind, min_distance, arguments.dividing, True)
-    mark_changed(arguments.step.vertices, corners)
+    mark_changed(arguments.step, arguments.status, corners)
     for j in range(4):
         update_first_contact(arguments.step.vertices, corners[j], toi, ContactKind.NONE, 0)
 

@@ -13,7 +13,7 @@ from ..._arguments import check_instance, checked_number
 from ...detection.at_rest.intersections import find_intersections
 from ...detection.run.phase_timer import PhaseTimer
 from ..state.status import Result, views_of
-from ..state.structs import FROZEN, NOT_FINITE, TRUNCATED, UNCERTIFIED
+from ..state.structs import FROZEN, NOT_FINITE, TRUNCATED, UNCERTIFIED, ContactKind
 from ..state.workspace import Workspace
 from .count_steps import StepResults
 from .drawing import Drawing
@@ -318,6 +318,15 @@ class SolverReport:
         what counts. Computed on each access, on the host.
         """
         return self._inside_finder.find(*self._placed)
+
+    def find_shapes_at(self, particles: np.ndarray) -> np.ndarray:
+        """Returns the shapes that have a constraint with one of some particles, in the last substep, sorted."""
+        constraints, first = self._work.constraints, self.model.particle_count
+        count, names = int(constraints.count.numpy()[0]), ("vertices", "kind", "plane")
+        corners, kind, plane = (getattr(constraints, name).numpy()[:count] for name in names)
+        at = np.isin(corners, particles).any(axis=1)
+        of_planes = self._motion.planes.shape.numpy()[plane[at & (kind == ContactKind.PLANE)]]
+        return np.union1d(of_planes, self.shape_of_vertices[corners[at][corners[at] >= first] - first])
 
     @property
     def penetrated(self) -> Penetrated:

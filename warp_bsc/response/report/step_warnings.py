@@ -98,11 +98,18 @@ class StepWarnings:
         named = name_particles(model, particles) + [shape_name(model, shape) for shape in shapes[:NAMED]]
         if len(shapes) > NAMED:
             named.append(f"{len(shapes) - NAMED} more shapes")
+        filtering = ""
+        if len(holding := report.find_shapes_at(particles)):
+            filtering = (
+                f"To let particles pass through {first_of([shape_name(model, shape) for shape in holding])}: "
+                f"collision_filter=CollisionFilter(shape_mask=mask), with mask = np.full({model.shape_count}, -1) and "
+                f"mask[{holding.tolist()}] = 0. "
+            )
         or_invert = ", or invert a tetrahedron" if report.prevents_inversions else ""
         return (
             f"a step is not certified, its motion may pass through something{or_invert}: {', '.join(named)}. "
-            "To look closer: report.uncertified_vertices and report.uncertified_bodies list all of that step, and "
-            "report.draw(viewer) shows them in red"
+            f"{filtering}To look closer: report.uncertified_vertices and report.uncertified_bodies list all of that "
+            "step, and report.draw(viewer) shows them in red"
         )
 
     def _of_strain(self):

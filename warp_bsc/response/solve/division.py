@@ -12,7 +12,7 @@ from ..contacts import first_contact
 from ..contacts.constraints import NEVER_VIOLATED, TOUCH, has_pushed, kind_of_pair, min_distance_of, moves_body
 from ..contacts.first_contact import TIME_UNITS
 from ..contacts.planes_between import add_dividing_plane, has_planes
-from ..schedule import divides_now, divides_proximities, is_freezing
+from ..schedule import divides_now, divides_proximities, is_freezing, note_moved
 from ..state.poses import pose_between, velocity_between
 from ..state.status import Loop, SolveStatus
 from ..state.structs import (
@@ -85,7 +85,7 @@ def find_body_shares(step: Step, dividing: DividingPlanes, status: SolveStatus):
     vertices.first_contact[vertex] = NEVER
     if motion.bodies.inverse_mass[body] == 0.0:
         return
-    if is_freezing(status):
+    if is_freezing(status, motion.world[vertex]):
         wp.atomic_min(vertices.bodies.share, body, FREEZES)
         return
     share = ONE
@@ -96,6 +96,8 @@ def find_body_shares(step: Step, dividing: DividingPlanes, status: SolveStatus):
         share = wp.min(share, SHARE_OF_PATH * first_contact.contact_time(packed))
     if not complete or first_contact.contact_kind(packed) == ContactKind.NONE:
         vertices.bodies.loose[body] = 1
+    if share < ONE:
+        note_moved(status, motion.world[vertex])
     wp.atomic_min(vertices.bodies.share, body, wp.int64(wp.floor(TIME_UNITS * share)))
 
 
@@ -151,6 +153,7 @@ def _keep_on_sides(step: Step, dividing: DividingPlanes, status: SolveStatus, ve
     x1 = vertices.x1[vertex]
     end = dividing.reached[vertex]
     if end[0] != x1[0] or end[1] != x1[1] or end[2] != x1[2]:
+        note_moved(status, step.motion.world[vertex])
         vertices.x1[vertex] = end
         vertices.changed[vertex] = 1
         vertices.outcome[vertex] = _divided(dividing, vertex, vertices.outcome[vertex])
@@ -182,7 +185,7 @@ def truncate_vertices(step: Step, dividing: DividingPlanes, status: SolveStatus,
     vertices.first_contact[vertex] = NEVER
     if motion.inverse_mass[vertex] == 0.0:
         return
-    cuts = not is_freezing(status)
+    cuts = not is_freezing(status, motion.world[vertex])
     outcome = vertices.outcome[vertex]
     if not cuts and outcome & FROZEN != 0:
         return
@@ -207,6 +210,8 @@ def truncate_vertices(step: Step, dividing: DividingPlanes, status: SolveStatus,
     if divides and first_contact.contact_kind(packed) == ContactKind.NONE:
         vertices.velocity[vertex] = (end - x0) / float(dt)
         outcome = outcome | UNCONSTRAINED
+    if wp.length_sq(end - vertices.x1[vertex]) > 0.0:
+        note_moved(status, motion.world[vertex])
     vertices.x1[vertex] = end
     vertices.outcome[vertex] = outcome
 
@@ -226,12 +231,13 @@ def truncate_before_inversions(step: Step, tetrahedra: Tetrahedra, dividing: Div
     if motion.inverse_mass[particle] == 0.0 or outcome & FROZEN != 0:
         return
     vertices.changed[particle] = 1
-    if is_freezing(status):
+    if is_freezing(status, motion.world[particle]):
         _freeze_vertex(step, dividing, particle)
         wp.atomic_add(status.loop, int(Loop.NEWLY_FROZEN), 1)
         return
     x0 = to_double(motion.x0[particle])
     share = wp.max(SHARE_OF_PATH * first_contact.contact_time(packed), CUT)
+    note_moved(status, motion.world[particle])
     vertices.x1[particle] = to_single(x0 + share * (to_double(vertices.x1[particle]) - x0))
     want(dividing, particle, vertices.x1[particle])
     vertices.outcome[particle] = outcome | TRUNCATED

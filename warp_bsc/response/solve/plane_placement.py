@@ -13,7 +13,7 @@ import warp as wp
 
 from ..contacts.planes_between import FAR
 from ..contacts.rules import inverse_mass_of
-from ..schedule import divides_now
+from ..schedule import divides_after, divides_now
 from ..state.status import Loop, SolveStatus
 from ..state.structs import CUT_SHORT, FROZEN, NO_NODE, NOT_PLACED, PLACED, DividingPlanes, Step
 from ..state.vectors import HALF, ZERO, to_double
@@ -38,6 +38,9 @@ def begin_passes(step: Step, planes: DividingPlanes, particles: int, worlds: int
         status.loop[Loop.PASS] = 0
         status.loop[Loop.MORE_PASSES] = wp.where(planes.count[0] > 0, 1, 0)
     if i < worlds:
+        before = status.loop[Loop.ITERATION] - 1
+        if status.contact_iteration[i] == before and divides_after(status, i, before):
+            status.idle[i] = status.idle[i] + 1  # until something moves
         planes.moved[i] = 0
         planes.missed[i] = 0
     if i < particles and planes.first[i] != NO_NODE:

@@ -32,6 +32,7 @@ class Detection(IntEnum):
     OF_BODIES = 2  # contacts between bodies, which are delegated to the inner solver
     TOO_NEAR = 3  # 1 if a pair ends nearer than its separation, but not in contact
     FILTERED = 4  # contacts of shapes that do not collide by Newton's filters, and with planes that are filtered
+    OPEN = 5  # contacts in worlds that do not freeze yet
 
 
 class Result(IntEnum):
@@ -76,6 +77,8 @@ class SolveStatus:
     detection: wp.array[int]  # of Detection
     results: wp.array[int]  # of Result
     contact_iteration: wp.array[int]  # of each world, the iteration after which it last had a contact
+    idle: wp.array[int]  # of each world, divisions in succession that move nothing, with this one; it freezes from 2 on
+    is_stuck: wp.array[int]  # of each world, 1 if a vertex collides that was frozen lately
     is_fast: wp.array[int]  # of each world, 1 if predicted paths of fast or pushing elements or bodies collide
     crossings: wp.array[int]  # of each world, edges that cross faces at the start
     of_worlds: WorldCounts

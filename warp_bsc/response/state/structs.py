@@ -141,6 +141,7 @@ class Vertices:
     particle_delta_x: wp.array2d[wp.int64]  # position changes summed over constraints, see sweeps.add_delta
     particle_delta_v: wp.array2d[wp.int64]  # velocity changes summed over constraints
     first_contact: wp.array[wp.int64]  # see first_contact.packed_contact
+    frozen_lately: wp.array[int]  # steps for which it counts as one that was, see STUCK_STEPS
     changed: wp.array[int]  # 1 if it may have other contacts than those that the last detection found
     outcome: wp.array[int]  # bits of PROJECTED, DIVIDED, TRUNCATED, FROZEN, NOT_FINITE, UNCONSTRAINED
     bodies: MovedBodies

@@ -22,6 +22,7 @@ from ..tuning import (
     PAIRS_PER_FACE,
     PAIRS_PER_STATIC_FACE,
     SLOW_POSITION_SWEEPS,
+    STUCK_STEPS,
     SWEEPS_PER_BATCH,
     THREADS,
     TOLERANCE,
@@ -29,9 +30,10 @@ from ..tuning import (
 from .cluster import BLOCK, begin_worlds, count_constraints, list_constraints, threads_of_world
 from .launches import Launches
 from .mesh import ModelMesh, grouped_by_world
-from .motion import ModelMotion, takes_part
+from .motion import ModelMotion, continues, takes_part
 from .status import Detection, Loop, Result, SolveStatus, WorldCounts, clear_status, single_elements, start_sweeps
 from .structs import (
+    FROZEN,
     NEVER,
     NO_NODE,
     NOT_FINITE,
@@ -63,6 +65,8 @@ def _begin(step: Step, worlds: int, dividing: DividingPlanes, status: SolveStatu
         step.constraints.count[0] = 0
         dividing.count[0] = 0
     if i < worlds:
+        status.idle[i] = 0
+        status.is_stuck[i] = 0
         status.contact_iteration[i] = -1
         status.is_fast[i] = 0
         if status.of_worlds.found:
@@ -83,6 +87,9 @@ def _begin(step: Step, worlds: int, dividing: DividingPlanes, status: SolveStatu
         vertices.particle_delta_v[i, axis] = wp.int64(0)
     vertices.first_contact[i] = NEVER
     vertices.changed[i] = 0
+    if motion.inverse_mass[i] > 0.0:  # not in worlds that take no part
+        left = wp.where(vertices.outcome[i] & FROZEN != 0, STUCK_STEPS, vertices.frozen_lately[i] - 1)
+        vertices.frozen_lately[i] = wp.where(continues(motion, motion.world[i]), wp.max(left, 0), 0)
     vertices.outcome[i] = wp.where(motion.is_not_finite[i] != 0, NOT_FINITE, 0)
     dividing.first[i] = NO_NODE
     dividing.lacks[i] = 0
@@ -113,7 +120,7 @@ def _allocate_status(worlds: int, device: wp.Device, max_iterations: int) -> Sol
     status = SolveStatus()
     for name, fields in (("loop", Loop), ("detection", Detection), ("results", Result)):
         setattr(status, name, wp.zeros(len(fields), dtype=int, device=device))
-    for name in ("contact_iteration", "is_fast", "crossings"):
+    for name in ("contact_iteration", "idle", "is_stuck", "is_fast", "crossings"):
         setattr(status, name, wp.zeros(worlds, dtype=int, device=device))
     status.max_iterations = max_iterations
     status.max_slow_iterations = MAX_SLOW_ITERATIONS
