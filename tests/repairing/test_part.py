@@ -70,6 +70,30 @@ def test_the_whole_is_searched_where_the_part_is_strained(searched, monkeypatch)
     assert len(searched) == 2 and max(searched) < 0.5 * len(x)
 
 
+def test_what_crosses_and_is_fixed_keeps_no_part_from_being_freed(searched, monkeypatch):
+    faces, x = sheets(60, 0.7, 3.0)
+    n = len(x)
+    # a fixed pair of sheets of its own, which cross each other where the others are, and far away
+    body, places = sheets(12, 0.7, 3.0)
+    near, far = 0.2 * places + (0.3, 0.4, -0.2), 0.2 * places + (5.0, 5.0, 5.0)
+    x, faces = np.concatenate([x, near, far]), np.concatenate([faces, body + n, body + n + len(places)])
+    monkeypatch.setattr(free, "_found", lambda surface, *_: surface.home)
+    found = bsc.repair(faces, x, fixed=np.arange(n, len(x)), device="cpu")
+    assert searched[0] < 0.6 * n
+    assert not found.certified and found.crossings < found.crossings_before
+    fixed = bsc.CollisionMesh(faces[faces[:, 0] >= n], len(x), device="cpu")
+    assert found.crossings == len(bsc.CollisionDetector(fixed).find_intersections(x)) > 0
+    assert all(contour.reason == "both of its sides are fixed" for contour in found.unresolved)
+
+
+def test_without_contours_there_is_no_part():
+    faces, x = sheets(20, 0.7, 3.0)
+    surface = Surface(bsc.CollisionMesh(faces, len(x), device="cpu"), x, np.zeros(len(x), dtype=bool))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(part, "_LEAST_CELLS", 0)
+        assert Part.around(surface, np.zeros((0, 2), dtype=int)) is None
+
+
 def test_a_large_face_across_the_part_is_no_gap_in_it():
     faces, x = sheets(60, 0.7, 3.0)
     # far corners, a little below the lower sheet

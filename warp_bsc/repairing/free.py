@@ -61,16 +61,18 @@ def search(
 
 
 def _found_in_part(surface: Surface, before: Faults, max_strain: float) -> Faults | None:
-    """Returns what is wrong with positions, nothing, that only the part around contours is searched for, or None."""
-    part = Part.around(surface, before.crossings)
+    """Returns what is wrong with positions, only what is fixed, that a search of a part alone gives; None for none."""
+    part = Part.around(surface, before.crossings[~surface.are_fixed(before.crossings)])
     if part is None:
         return None
     x, springs = _opened(part, part.home, part.crossings(part.home), None)
-    if len(part.crossings(x)) or not part.is_apart(x):
+    if not part.are_fixed(part.crossings(x)).all() or not part.is_apart(x):
         return None
     x = approach(part, x, springs, max_strain, _ROUNDS_CROSSING)
-    found = Faults(surface, part.in_whole(x)) if part.is_apart(x) and part.strain(x) <= max_strain else None
-    return None if found else found
+    if not part.is_apart(x) or part.strain(x) > max_strain:
+        return None
+    found = Faults(surface, part.in_whole(x))
+    return None if found.inside.size or not surface.are_fixed(found.crossings).all() else found
 
 
 def _found(surface: Surface, before: Faults, max_strain: float, history, sheet, chosen: np.ndarray) -> np.ndarray:

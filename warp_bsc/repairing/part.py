@@ -44,7 +44,7 @@ class Part(Surface):
     def around(whole: Surface, crossings: np.ndarray) -> "Part | None":
         """Returns the part around crossings, (edge, face), shape [m, 2]; None where the whole is searched as well."""
         cells = whole.mesh.cells
-        if whole.keeps_distance or len(whole.tetrahedra) or len(cells) < _LEAST_CELLS:
+        if not len(crossings) or whole.keeps_distance or len(whole.tetrahedra) or len(cells) < _LEAST_CELLS:
             return None
         contours, reach = trace_contours(whole.mesh, crossings), _REACH * whole.edge
         if len(contours.kinds) > _MOST_CONTOURS:
