@@ -138,6 +138,14 @@ def test_a_part_has_all_that_bears_on_its_contours(searched):
         moved = found.home.copy()
         moved[vertex] += 0.01
         assert not found.is_apart(moved)
+
+    def is_apart_after(vertex, by):
+        moved = found.home.copy()
+        moved[vertex, 2] += by
+        return found.is_apart(moved)
+
+    inner = [vertex for vertex in np.flatnonzero(~found.fixed)[::50] if is_apart_after(vertex, 1e-3)]
+    assert inner and not any(is_apart_after(vertex, 100.0) for vertex in inner)  # where other cells may be
     moved = found.home.copy()
     moved[~found.fixed] += 0.01
     assert (surface.moved(found.in_whole(moved))[found.vertices] == found.moved(moved)).all()

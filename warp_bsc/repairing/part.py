@@ -21,11 +21,12 @@ class Part(Surface):
         vertices: Its vertices in the whole, int, shape [k].
     """
 
-    def __init__(self, whole: Surface, is_kept: np.ndarray):
-        """Takes the cells of a whole that are kept, bool, shape [n]: see :attr:`.CollisionMesh.cells`."""
+    def __init__(self, whole: Surface, is_kept: np.ndarray, boxes: list[tuple[np.ndarray, np.ndarray]]):
+        """Takes the cells of a whole that meet boxes, bool, shape [n]: see :attr:`.CollisionMesh.cells`."""
         mesh, count = whole.mesh, len(whole.home)
         is_used, is_shared = (np.zeros(count, dtype=bool) for _ in range(2))
         is_used[mesh.cells[is_kept]] = is_shared[mesh.cells[~is_kept]] = True
+        self._boxes = boxes
         self.vertices, self._whole, self._shared = np.flatnonzero(is_used), whole, is_shared[is_used]
         cells = (np.cumsum(is_used) - 1)[mesh.cells]
         sizes = np.cumsum([len(mesh.faces), len(mesh.free_edges)])
@@ -51,17 +52,22 @@ class Part(Surface):
             return None
         a, b, c = (whole.home[corners] for corners in cells.T)
         low, high = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
-        is_kept = np.zeros(len(cells), dtype=bool)
+        is_kept, boxes = np.zeros(len(cells), dtype=bool), []
         for number in range(len(contours.kinds)):
             of_contour = crossings[contours.number == number]
             vertices = np.append(whole.mesh.edges[of_contour[:, 0]], whole.mesh.faces[of_contour[:, 1]])
             places = whole.home[vertices]
-            is_kept |= ((high >= places.min(axis=0) - reach) & (low <= places.max(axis=0) + reach)).all(axis=1)
-        return None if is_kept.mean() > _LARGEST_SHARE else Part(whole, is_kept)
+            box = places.min(axis=0) - reach, places.max(axis=0) + reach
+            is_kept |= ((high >= box[0]) & (low <= box[1])).all(axis=1)
+            boxes.append(box)
+        return None if is_kept.mean() > _LARGEST_SHARE else Part(whole, is_kept, boxes)
 
     def is_apart(self, x: np.ndarray) -> bool:
-        """Returns whether nothing that moves to positions in units is next to the rest of the whole."""
-        return not within(self, differ(x, self.home), 1)[self._shared].any()
+        """Returns whether what moves to positions in units is apart from the rest, in boxes that no other cell meets."""
+        moved = differ(x, self.home)
+        places = self.in_whole(x)[self.vertices[moved]]
+        inside = [((places >= low) & (places <= high)).all(axis=1) for low, high in self._boxes]
+        return bool(np.any(inside, axis=0).all()) and not within(self, moved, 1)[self._shared].any()
 
     def in_whole(self, x: np.ndarray) -> np.ndarray:
         """Returns positions of the whole, in its units."""
