@@ -63,7 +63,7 @@ class Part(Surface):
         return None if is_kept.mean() > _LARGEST_SHARE else Part(whole, is_kept, boxes)
 
     def is_apart(self, x: np.ndarray) -> bool:
-        """Returns whether what moves to positions in units is apart from the rest, in boxes that no other cell meets."""
+        """Returns whether what moves to positions in units is apart from the rest, in boxes no other cell meets."""
         moved = differ(x, self.home)
         places = self.in_whole(x)[self.vertices[moved]]
         inside = [((places >= low) & (places <= high)).all(axis=1) for low, high in self._boxes]
