@@ -1,8 +1,8 @@
 """Measures ``warp-bsc repair`` on shots: what collides before and after, how far points move, and the time.
 
 ``python tests/support/repair_shots.py`` repairs recorded scenes of ``assets/`` and a cloth that VBD drapes without
-self-contact, on the CPU, each twice; times are those of the faster run. It prints a row for each shot, and ``--json``
-writes them to a file as well.
+self-contact, each twice, on the CPU or ``--device``; times are those of the faster run. It prints a row for each shot,
+and ``--json`` writes them to a file as well.
 """
 
 import contextlib
@@ -34,10 +34,10 @@ SHOTS = (
 RUNS = 2
 
 
-def repair(path, output, options):
+def repair(path, output, options, device):
     """Runs the command, and returns the results that it prints."""
     with contextlib.redirect_stdout(io.StringIO()) as printed:
-        status = run_command(["repair", str(path), "--output", str(output), "--device", "cpu", "--json", *options])
+        status = run_command(["repair", str(path), "--output", str(output), "--device", device, "--json", *options])
     if status:
         raise SystemExit(f"exit status {status} of the repair of {path}")
     return json.loads(printed.getvalue())
@@ -89,7 +89,7 @@ COLUMNS = (
 
 def main():
     """Measures all shots."""
-    arguments = options_of(__doc__).parse_args()
+    arguments = options_of(__doc__, device="cpu").parse_args()
     wp.config.log_level = wp.LOG_WARNING
     rows = []
     with tempfile.TemporaryDirectory() as temporary:
@@ -97,7 +97,7 @@ def main():
         write_shot(folder / DRAPE)
         for name, options in SHOTS:
             path, output = (folder if name == DRAPE else ASSETS) / name, folder / "fixed.usdc"
-            runs = [repair(path, output, options) for _ in range(RUNS)]
+            runs = [repair(path, output, options, arguments.device) for _ in range(RUNS)]
             seconds = {key: min(run["seconds"][key] for run in runs) for key in runs[0]["seconds"]}
             row = {"shot": name, "options": list(options), "before": runs[0]["before"], "left": runs[0]["remaining"]}
             row |= compare(path, output) | {"seconds": seconds}
@@ -108,7 +108,7 @@ def main():
         "Shot",
         COLUMNS,
         rows,
-        [wp.get_device("cpu")],
+        [wp.get_device(arguments.device)],
         name=lambda row: " ".join((row["shot"], *row["options"])),
     )
 
