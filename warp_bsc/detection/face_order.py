@@ -13,31 +13,38 @@ CLUSTER = WIDTH
 BUNDLE = WIDTH * CLUSTER
 """Places of a bundle."""
 
-_LARGE = wp.constant(4096)
-"""Faces of a part that is split along the best of four axes instead of eight, which takes less time."""
-
-_STAMPS = 16
-"""Stamps that halving a part takes, at most."""
+_STAMPS = 5
+"""Stamps that halving a part takes."""
 
 _MIN_OWN_CLUSTER = 8
 """Connected components with fewer faces share clusters, so that at most three of four places are empty."""
 
+_Counts = wp.types.vector(length=8, dtype=int)
+
 _AXES = wp.constant(wp.types.matrix(shape=(8, 2), dtype=int)(1, 0, 0, 1, 1, 1, 1, -1, 2, 1, 2, -1, 1, 2, 1, -2))
 """Directions in the plane of both coordinates, from pole to pole, along which parts may be split."""
+
+_LARGE = wp.constant(4096)
+"""Faces of a part that is split along the best of four axes instead of eight, which takes less time."""
+
+_HALVINGS = wp.constant(2)
+"""Times that a part is halved by the same coordinates."""
 
 
 @wp.struct
 class _Faces:
     """The faces of a mesh while they are ordered."""
 
-    links: wp.array2d[int]  # the faces that each is linked to at its edges, -1 for none
+    links: wp.array2d[int]  # the faces of its part that each is linked to at its edges, -1 for none
     order: wp.array[int]
-    place_of: wp.array[int]  # in the order
     visited: wp.array[int]  # stamp of the last search that came to a face
-    queue: wp.array[int]  # a part in another order, by place, as are the next two
+    queue: wp.array[int]  # a part in another order, by place, as are the next four
+    u: wp.array[int]
+    v: wp.array[int]
     keys: wp.array[int]
     buckets: wp.array[int]
     distances: wp.array2d[int]  # of each face from four poles
+    halves: wp.array[int]  # bits of each face: whether it would be in the second half along an axis
 
 
 @wp.func
@@ -67,8 +74,7 @@ def _visit(faces: _Faces, begin: int, end: int, seed: int, stamp: int, distance:
             for k in range(faces.links.shape[1]):
                 other = faces.links[face, k]
                 if other >= 0:
-                    place = faces.place_of[other]
-                    if place >= begin and place < end and faces.visited[other] != stamp:
+                    if faces.visited[other] != stamp:
                         faces.visited[other] = stamp
                         distance[other] = steps
                         faces.queue[filled] = other
@@ -90,41 +96,22 @@ def _split_at(begin: int, end: int):
 
 
 @wp.kernel(**NO_GRADIENTS)
-def _find_components(faces: _Faces, starts: wp.array[int], component_count: wp.array[int]):
-    """Writes the faces by connected component to the queue, and where each component starts."""
-    count = int(0)
-    filled = int(0)
-    for i in range(faces.order.shape[0]):
-        if faces.visited[faces.order[i]] == 0:
-            starts[count] = filled
-            count += 1
-            faces.visited[faces.order[i]] = 1
-            faces.queue[filled] = faces.order[i]
-            read = int(filled)
-            filled += 1
-            while read < filled:
-                face = faces.queue[read]
-                read += 1
-                for k in range(faces.links.shape[1]):
-                    other = faces.links[face, k]
-                    if other >= 0:
-                        if faces.visited[other] == 0:
-                            faces.visited[other] = 1
-                            faces.queue[filled] = other
-                            filled += 1
-    component_count[0] = count
+def _visit_all(faces: _Faces):
+    """Writes all faces by connected component to the queue, breadth first."""
+    _visit(faces, 0, faces.order.shape[0], faces.order[0], 1, faces.distances[0])
 
 
 @wp.func
-def _farthest(begin: int, end: int, order: wp.array[int], distances: wp.array2d[int], poles: int):
-    """Returns the face of a part that is farthest from the nearest of some poles."""
-    farthest = order[begin]
+def _farthest(faces: _Faces, begin: int, end: int, poles: int):
+    """Returns the face of a part that is farthest from the nearest of some poles; uses the keys."""
+    farthest = faces.order[begin]
     most = int(-1)
     for i in range(begin, end):
-        face = order[i]
-        nearest = distances[0, face]
-        for pole in range(1, poles):
-            nearest = wp.min(nearest, distances[pole, face])
+        face = faces.order[i]
+        nearest = faces.distances[poles - 1, face]
+        if poles > 1:
+            nearest = wp.min(nearest, faces.keys[i])
+        faces.keys[i] = nearest
         if nearest > most:
             most = nearest
             farthest = face
@@ -132,92 +119,110 @@ def _farthest(begin: int, end: int, order: wp.array[int], distances: wp.array2d[
 
 
 @wp.func
-def _coordinate(axis: int, face: int, distances: wp.array2d[int]):
-    """Returns the coordinate of a face along an axis."""
-    u = distances[0, face] - distances[1, face]
-    v = distances[2, face] - distances[3, face]
+def _mark_half(faces: _Faces, begin: int, split: int, end: int, axis: int):
+    """Sets the bit of an axis in those faces of a part that are in its second half along the axis, by counting."""
     axes = _AXES
-    return axes[axis, 0] * u + axes[axis, 1] * v
-
-
-@wp.func
-def _sort(faces: _Faces, begin: int, end: int, axis: int):
-    """Writes the faces of a part to the queue, sorted along an axis, by counting."""
-    keys = faces.keys
-    buckets = faces.buckets
-    lowest = _coordinate(axis, faces.order[begin], faces.distances)
-    highest = lowest
+    lowest, highest = int(2147483647), int(-2147483647)
     for i in range(begin, end):
-        key = _coordinate(axis, faces.order[i], faces.distances)
+        key = axes[axis, 0] * faces.u[faces.order[i]] + axes[axis, 1] * faces.v[faces.order[i]]
         lowest = wp.min(lowest, key)
         highest = wp.max(highest, key)
-        keys[i] = key
-        buckets[i] = 0
-    width = (highest - lowest) / (end - begin) + 1
+        faces.keys[i] = key
+        faces.buckets[i] = 0
+    shift = int(0)
+    while (highest - lowest) >> shift >= end - begin:
+        shift += 1
     for i in range(begin, end):
-        bucket = begin + (keys[i] - lowest) / width
-        keys[i] = bucket
-        buckets[bucket] = buckets[bucket] + 1
-    place = int(begin)
+        bucket = begin + ((faces.keys[i] - lowest) >> shift)
+        faces.keys[i] = bucket
+        faces.buckets[bucket] = faces.buckets[bucket] + 1
+    middle = int(begin)
+    left = split - begin  # places of the first half
+    while faces.buckets[middle] <= left:
+        left -= faces.buckets[middle]
+        middle += 1
     for i in range(begin, end):
-        size = buckets[i]
-        buckets[i] = place
-        place += size
-    for i in range(begin, end):
-        bucket = keys[i]
-        faces.queue[buckets[bucket]] = faces.order[i]
-        buckets[bucket] = buckets[bucket] + 1
+        bucket = faces.keys[i]
+        is_second = bucket > middle
+        if bucket == middle:
+            is_second = left <= 0
+            left -= 1
+        bits = wp.where(axis == 0, 0, faces.halves[faces.order[i]])
+        faces.halves[faces.order[i]] = bits | (int(is_second) << axis)
 
 
 @wp.func
-def _count_cut(faces: _Faces, begin: int, split: int, end: int, stamp: int):
-    """Returns how many links the two halves of a part in the queue have with one another."""
-    for i in range(begin, split):
-        faces.visited[faces.queue[i]] = stamp
-    cut = int(0)
-    for i in range(split, end):
+def _halve(faces: _Faces, begin: int, split: int, end: int):
+    """Orders a part by the half that its faces are in, along the axis whose halves share the fewest edges."""
+    axes = wp.where(end - begin > _LARGE, 4, 8)
+    for axis in range(axes):
+        _mark_half(faces, begin, split, end, axis)
+    cuts = _Counts()  # links from the second half to the first
+    for i in range(begin, end):
+        face = faces.order[i]
         for k in range(faces.links.shape[1]):
-            other = faces.links[faces.queue[i], k]
+            other = faces.links[face, k]
             if other >= 0:
-                place = faces.place_of[other]
-                if place >= begin and place < end and faces.visited[other] == stamp:
-                    cut += 1
-    return cut
+                cut = faces.halves[face] & ~faces.halves[other]
+                if cut != 0:
+                    for axis in range(axes):
+                        cuts[axis] += (cut >> axis) & 1
+    best = int(0)
+    for axis in range(1, axes):
+        if cuts[axis] < cuts[best]:
+            best = axis
+    first, second = begin + int(0), split + int(0)
+    for i in range(begin, end):
+        face = faces.order[i]
+        if (faces.halves[face] >> best) & 1 == 0:
+            faces.queue[first] = face
+            first += 1
+        else:
+            faces.queue[second] = face
+            second += 1
+    for i in range(begin, end):
+        face = faces.queue[i]
+        faces.order[i] = face
+        for k in range(faces.links.shape[1]):
+            other = faces.links[face, k]
+            if other >= 0:
+                if ((faces.halves[face] ^ faces.halves[other]) >> best) & 1 != 0:
+                    faces.links[face, k] = -1
 
 
 @wp.kernel(**NO_GRADIENTS)
-def _halve_parts(first: int, faces: _Faces, parts: wp.array[wp.vec2i], stamp: int, splits: wp.array[int]):
-    """Orders each part by the half that its faces are in; parts may be halved at once, as no face is in two.
+def _split_parts(first: int, faces: _Faces, parts: wp.array[wp.vec2i], stamp: int, split: wp.array2d[wp.vec2i]):
+    """Halves each part a few times, by the same coordinates; parts may be split at once, as no face is in two.
 
     A part has the places from the first to before the second of its numbers. ``stamp`` is :data:`_STAMPS` more than in
     the launch before.
     """
-    i = first + wp.tid()
-    begin = parts[i][0]
-    end = parts[i][1]
-    order = faces.order
-    _visit(faces, begin, end, order[begin], stamp, faces.distances[0])
+    part = first + wp.tid()
+    begin = parts[part][0]
+    end = parts[part][1]
+    _visit(faces, begin, end, faces.order[begin], stamp, faces.distances[0])
     pole = faces.queue[end - 1]
     for k in range(4):
         if k > 0:
-            pole = _farthest(begin, end, order, faces.distances, k)
+            pole = _farthest(faces, begin, end, k)
         _visit(faces, begin, end, pole, stamp + 1 + k, faces.distances[k])
-    for k in range(begin, end):
-        order[k] = faces.queue[k]
-    split = _split_at(begin, end)
-    best = int(0)
-    least_cut = int(2147483647)
-    for axis in range(wp.where(end - begin > _LARGE, 4, 8)):
-        _sort(faces, begin, end, axis)
-        cut = _count_cut(faces, begin, split, end, stamp + 5 + axis)
-        if cut < least_cut:
-            least_cut = cut
-            best = axis
-    _sort(faces, begin, end, best)
-    for k in range(begin, end):
-        order[k] = faces.queue[k]
-        faces.place_of[faces.queue[k]] = k
-    splits[i] = split
+    for i in range(begin, end):
+        face = faces.queue[i]
+        faces.order[i] = face
+        faces.u[face] = faces.distances[0, face] - faces.distances[1, face]
+        faces.v[face] = faces.distances[2, face] - faces.distances[3, face]
+    split[part, 0] = parts[part]
+    count = int(1)
+    for _halving in range(_HALVINGS):
+        for k in range(count - 1, -1, -1):
+            start, stop = split[part, k][0], split[part, k][1]
+            middle = stop
+            if stop - start > CLUSTER:
+                middle = _split_at(start, stop)
+                _halve(faces, start, middle, stop)
+            split[part, 2 * k] = wp.vec2i(start, middle)
+            split[part, 2 * k + 1] = wp.vec2i(middle, stop)
+        count *= 2
 
 
 def _links(faces: np.ndarray) -> np.ndarray:
@@ -261,8 +266,8 @@ def order_faces(faces: np.ndarray, world: np.ndarray | None = None) -> np.ndarra
 
     Connectivity alone decides, so that the order stays good however the mesh moves. Each component is bisected until
     its parts fit in clusters. Breadth-first searches from four faces at its rim, far from one another, give each face
-    coordinates, the differences of its distances from two opposite ones. Of several directions in these coordinates
-    the one is halved whose halves share the fewest edges. Time grows with ``n log n``.
+    coordinates, the differences of its distances from two opposite ones, of which every second part gets new ones. Of
+    several directions in them the one is halved whose halves share the fewest edges. Time grows with ``n log n``.
 
     Args:
         faces: Vertex indices of the faces, int32, shape [face_count, 3].
@@ -271,8 +276,7 @@ def order_faces(faces: np.ndarray, world: np.ndarray | None = None) -> np.ndarra
     Returns:
         Face at each place, -1 for none, int32, shape [a multiple of CLUSTER]; up to four times as many as faces.
     """
-    n = len(faces)
-    if n == 0:
+    if not (n := len(faces)):
         return np.empty(0, dtype=np.int32)
 
     def on_host(values: np.ndarray) -> wp.array:
@@ -281,8 +285,8 @@ def order_faces(faces: np.ndarray, world: np.ndarray | None = None) -> np.ndarra
     links, mesh = _links(faces), _Faces()
     order = np.arange(n) if world is None else np.argsort(world, kind="stable")
     mesh.links, mesh.order, mesh.visited, mesh.queue = map(on_host, (links, order, np.zeros(n), np.zeros(n)))
-    starts, count = on_host(np.zeros(n)), on_host(np.zeros(1))
-    launch(_find_components, 1, inputs=[mesh, starts, count], device="cpu", record_tape=False)
+    mesh.distances = wp.empty((4, n), dtype=int, device="cpu")
+    launch(_visit_all, 1, inputs=[mesh], device="cpu", record_tape=False)
 
     # neighbours get numbers close to one another, for the sake of processor caches
     face_of = mesh.queue.numpy()
@@ -290,25 +294,22 @@ def order_faces(faces: np.ndarray, world: np.ndarray | None = None) -> np.ndarra
     number_of[face_of] = np.arange(n)
     number_of[-1] = -1
     links = number_of[links[face_of]]
-    starts = starts.numpy()[: count.numpy()[0]]
+    # the first face of a component has no link to one before it
+    starts = np.flatnonzero((links.view(np.uint32) >= np.arange(n)[:, None]).all(axis=1))
     sizes = np.diff(starts, append=n)
     places = _component_places(sizes)
     place_of = np.arange(n) + np.repeat(places[:-1] - starts, sizes)
     numbers = np.full(places[-1], -1, dtype=np.int32)
     numbers[place_of] = np.arange(n)
 
-    device = wp.get_device("cpu")
-    mesh.links, mesh.order, mesh.place_of, mesh.visited = map(on_host, (links, numbers, place_of, np.zeros(n)))
-    mesh.queue, mesh.keys, mesh.buckets = (wp.empty_like(mesh.order) for _ in range(3))
-    mesh.distances = wp.empty((4, n), dtype=int, device=device)
+    mesh.links, mesh.order, mesh.visited, mesh.halves = map(on_host, (links, numbers, np.zeros(n), np.zeros(n)))
+    mesh.queue, mesh.u, mesh.v, mesh.keys, mesh.buckets = (wp.empty_like(mesh.order) for _ in range(5))
     parts = np.stack([places[:-1], places[:-1] + sizes], axis=1)
     stamp = 1
     while len(parts := parts[parts[:, 1] - parts[:, 0] > CLUSTER]):
-        splits = wp.empty(len(parts), dtype=int, device=device)
-        inputs = [mesh, wp.array(parts.astype(np.int32), dtype=wp.vec2i, device=device), stamp]
-        launch_over(_halve_parts, len(parts), inputs=inputs, outputs=[splits], device=device, chunk=1)
-        middle = splits.numpy()
-        parts = np.concatenate([np.stack([parts[:, 0], middle], axis=1), np.stack([middle, parts[:, 1]], axis=1)])
+        split = wp.empty((len(parts), 2**_HALVINGS), dtype=wp.vec2i, device="cpu")
+        inputs = [mesh, wp.array(parts.astype(np.int32), dtype=wp.vec2i, device="cpu"), stamp]
+        launch_over(_split_parts, len(parts), inputs=inputs, outputs=[split], device=wp.get_device("cpu"), chunk=1)
+        parts = split.numpy().reshape(-1, 2)
         stamp += _STAMPS
-    result = mesh.order.numpy()
-    return np.where(result < 0, -1, face_of[result])
+    return np.where((order := mesh.order.numpy()) < 0, -1, face_of[order])

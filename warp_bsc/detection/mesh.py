@@ -173,11 +173,10 @@ class CollisionMesh:
         is_used[self.points] = True
         self.vertices = np.flatnonzero(is_used).astype(np.int32)
         # the representative of an element is the first face that has it: bits 0 to 2 corners, 3 to 5 edges
-        owned = np.zeros(len(self.faces), dtype=np.int32)
-        np.bitwise_or.at(owned, first_corners // 3, 1 << (first_corners % 3))
         first_sides = first_sides[proper & (first_sides < len(sides))]
-        np.bitwise_or.at(owned, first_sides // 3, 8 << (first_sides % 3))
-        self.face_edges, self.owned = face_edges.astype(np.int32), owned
+        bits = np.append(1 << (first_corners % 3), 8 << (first_sides % 3))
+        owned = np.bincount(np.append(first_corners, first_sides) // 3, bits, len(self.faces))
+        self.face_edges, self.owned = face_edges.astype(np.int32), owned.astype(np.int32)
         self.device_vertices = wp.array(self.vertices, dtype=int, device=self.device)
         self.device_faces = wp.array(self.faces, dtype=int, device=self.device)
         self.device_edges = wp.array(self.edges, dtype=int, device=self.device)
