@@ -250,6 +250,25 @@ def test_layers_of_small_cells_rest_on_each_other(device):
     assert np.abs(state.particle_qd.numpy()).max() < 5e-3
 
 
+def test_boxes_of_candidates_hold_what_rests_and_more_where_something_moves(device):
+    """Not where gravity alone would take it in the step: candidates of a pile at rest are few."""
+    solver = bsc.SolverImplicit(sheets(device, 0.01, 0.0015, 0.0))
+    state, end = solver.model.state(), solver.model.state()
+    step(solver, state, end, 20)
+    trial = solver.newton_method.problem.trial
+    margin = trial.margin.numpy()[:, None]
+    for speed in (0.0, 1.0):
+        velocity = state.particle_qd.numpy()
+        velocity[-1, 2] = speed
+        state.particle_qd.assign(velocity)
+        step(solver, state, end)
+        rest = slice(0, -10)  # all but what is near the particle that flies off
+        beyond = np.maximum(trial.origin.numpy() - trial.lower.numpy(), trial.upper.numpy() - trial.origin.numpy())
+        assert (beyond >= (0.99 if speed else 0.49) * margin)[rest].all()
+        assert (beyond < (1.4 if speed else 0.9) * margin)[rest].all()
+        assert GRAVITY * DT**2 > 1.5 * margin.max()
+
+
 def test_what_a_program_presses_into_a_wedge_has_not_arrived(device):
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
     builder.add_shape_box(-1, hx=0.2, hy=0.2, hz=0.1, xform=wp.transform(wp.vec3(0.0, 0.0, -0.1), wp.quat_identity()))

@@ -203,10 +203,7 @@ BLOCKS = {False: (256, 1), True: (512, 1)}
 has more registers where there are few."""
 ADVANCE = {
     is_many: wp.kernel(
-        _advance,
-        enable_backward=False,
-        module=f"{__name__}.of_{'many' if is_many else 'few'}",
-        launch_bounds=blocks,
+        _advance, enable_backward=False, module=f"{__name__}.of_{'many' if is_many else 'few'}", launch_bounds=blocks
     )
     for is_many, blocks in BLOCKS.items()
 }

@@ -39,14 +39,7 @@ def _inverse(block: wp.mat33, least: float) -> wp.mat33:
 
 
 @wp.func
-def _inertia(
-    unknowns: Unknowns,
-    trial: Trial,
-    motion: Motion,
-    bodies: SolvedBodies,
-    dt: wp.float64,
-    u: int,
-):
+def _inertia(unknowns: Unknowns, trial: Trial, motion: Motion, bodies: SolvedBodies, dt: wp.float64, u: int):
     """Returns the gradient of the inertia by an unknown, and its block of the diagonal."""
     p = unknowns.particle[u]
     if p < 0:
@@ -77,14 +70,7 @@ def differentiate(at: Place, p: Problem) -> wp.vec4i:
         if i < 0:
             continue
         energy = find_derivatives(
-            i,
-            kind_of(p.elements, i),
-            p.elements,
-            p.trial.exact,
-            p.motion.x0,
-            p.settings.dt,
-            convex,
-            p.derivatives,
+            i, kind_of(p.elements, i), p.elements, p.trial.exact, p.motion.x0, p.settings.dt, convex, p.derivatives
         )
         add_energy(p.progress.energy, w, energy, p.settings.units)
     return wp.vec4i(int(Phase.LOADS), at.then, 0, 0)

@@ -340,22 +340,22 @@ class NewtonMethod:
         p.settings.dt = dt
         p.settings.recovery = self._metre * _RECOVERY_SPEED * dt
         p.settings.smoothing = self._metre * _SMOOTHING_SPEED * dt
-        p.least_change, p.far_change = (
-            self._precision * self._least_speed * self._dt,
-            self._metre * _FAR_SPEED * self._dt,
-        )
+        p.least_change = self._precision * self._least_speed * self._dt
+        p.far_change = self._metre * _FAR_SPEED * self._dt
         p.max_steps, p.max_late_steps = self.max_steps, max(LATE_STEPS, self.max_steps)
-        self._launch(steps.begin_unknowns, self._count, [motion, wp.float64(dt)], [p.unknowns, p.trial])
+        progress = p.progress
+        for zeros in (progress.active, progress.given_moves, progress.fastest, p.flow.arrived, p.flow.lacks):
+            zeros.zero_()
+        self.iterations.zero_()
+        given = [motion, self.mesh.model.gravity, wp.float64(dt)]
+        self._launch(steps.begin_unknowns, self._count, given, [p.unknowns, p.trial, p.progress])
         if self._attachments is not None:
             inputs = [self._attachments, work.motion.last.poses, end.body_q, wp.float64(dt)]
             outputs = [motion, p.unknowns, p.trial.goal, work.vertices, end.particle_q, end.particle_qd]
             self._launch(attach, self.mesh.model.particle_count, inputs, outputs)
-        for zeros in (p.progress.active, p.progress.given_moves, p.flow.arrived, p.flow.lacks, self.iterations):
-            zeros.zero_()
         wp.copy(self._sought, self._all_sought)
-        outputs = [p.unknowns, p.progress.active, p.bodies]
-        self._launch(bodies.begin_bodies, len(p.bodies.unknown), [motion], outputs)
-        inputs = [motion, self.mesh.model.gravity, self._dt, p.unknowns, p.bodies]
+        self._launch(bodies.begin_bodies, len(p.bodies.unknown), [motion], [p.unknowns, p.progress.active, p.bodies])
+        inputs = [*given, p.unknowns, p.bodies]
         self._launch(steps.begin_step, max(self.mesh.vertex_count, work.worlds), inputs, [p.trial, p.progress])
         wp.copy(p.trial.origin, motion.x0)
         p.trial.touched.fill_(pairs.NO_FACE)

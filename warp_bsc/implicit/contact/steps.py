@@ -19,6 +19,8 @@ _FINE = wp.constant(wp.float64(2.0**16))
 """Factor on products of displacements: a unit of energy is too coarse for them."""
 _ROUNDED = wp.constant(2.0**-20)
 """More than what rounding changes, as a share of a length."""
+_AT_REST = wp.constant(0.5)
+"""Speed, as a share of what gravity adds to it in a step, below which a vertex lies on something and does not fall."""
 _TRUNCATIONS = wp.constant(4)
 """Passes in which the displacements of single vertices are cut, before those of their world are."""
 
@@ -52,16 +54,24 @@ def predict_positions(
     v1[i] = v
 
 
+@wp.func
+def _way_without_fall(motion: Motion, gravity: wp.array[wp.vec3], dt: wp.float64, v: int) -> wp.vec3:
+    """Returns the predicted way of a vertex in the step without that on which this step's gravity takes it [m]."""
+    return motion.x1[v] - motion.x0[v] - float(dt * dt) * gravity[wp.max(motion.world[v], 0) % gravity.shape[0]]
+
+
 @wp.kernel
 def begin_unknowns(
     # in
     motion: Motion,
+    gravity: wp.array[wp.vec3],
     dt: wp.float64,
     # out
     unknowns: Unknowns,
     trial: Trial,
+    progress: Progress,
 ):
-    """Finds which particles are solved for, their inertia, and where inertia alone leads."""
+    """Finds which particles are solved for, their inertia, where inertia alone leads, and the fastest of each world."""
     u = wp.tid()
     p = unknowns.particle[u]
     if p < 0:
@@ -72,6 +82,7 @@ def begin_unknowns(
     if motion.inverse_mass[p] > 0.0 and motion.is_not_finite[p] == 0 and wp.isfinite(motion.x0[p]):
         unknowns.is_free[u] = 1
         unknowns.inertia[u] = ONE / (wp.float64(motion.inverse_mass[p]) * dt * dt)
+        raise_to(progress.fastest, motion.world[p], wp.length(_way_without_fall(motion, gravity, dt, p)))
 
 
 @wp.kernel
@@ -79,7 +90,7 @@ def begin_step(
     # in
     motion: Motion,
     gravity: wp.array[wp.vec3],
-    dt: float,
+    dt: wp.float64,
     unknowns: Unknowns,
     bodies: SolvedBodies,
     # out
@@ -102,12 +113,12 @@ def begin_step(
         progress.remaining[v] = 0.0
         progress.late[v] = 0
         progress.driven[v] = 0.0
-        progress.fall[v] = dt * dt * wp.length(gravity[v % gravity.shape[0]])
+        progress.fall[v] = float(dt * dt) * wp.length(gravity[v % gravity.shape[0]])
         progress.plane_share[v] = 0.0
         progress.leaves[v] = 0
     if v >= trial.x.shape[0]:
         return
-    x0, x1 = motion.x0[v], motion.x1[v]
+    x0, x1 = motion.x0[v], motion.x1[v] + wp.vec3()
     trial.x[v] = x0
     trial.exact[v] = to_double(x0)
     trial.moved[v] = to_double(x0)
@@ -127,7 +138,12 @@ def begin_step(
     elif unknowns.is_free[u] != 0:
         progress.active[motion.world[v]] = 1
     if is_solved(unknowns, v):
-        pad += 0.25 * wp.length(x1 - x0)
+        way = _way_without_fall(motion, gravity, dt, v)
+        if wp.length(way) < _AT_REST * wp.length(x1 - x0 - way):
+            x1 = x0 + way
+        length = wp.length(x1 - x0)
+        # where all is slow, little is enough for what a solve adds to ways
+        pad = wp.min(pad, 0.5 * pad + wp.max(progress.fastest[motion.world[v]], length)) + 0.25 * length
         if u < 0:
             unknowns.arm[v] = arm_on_body(bodies, motion, v, x0)
     trial.lower[v] = wp.min(x0, x1) - wp.vec3(pad)

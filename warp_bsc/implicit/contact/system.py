@@ -79,6 +79,7 @@ class Progress:
         before: The same in the one before it, as far as it was taken, -1 if it was not [m].
         way: How far a vertex has been, or is led by the displacements, from where it was at the start of the step [m].
         way_before: The same in the step before.
+        fastest: Longest way of a particle in the step as predicted, without this step's gravity [m].
         longest: Longest displacement of a vertex in the Newton step, or more [m].
         given_way: The same of what a program moves.
         remaining: Largest way of what a program moves that is left [m].
@@ -113,6 +114,7 @@ class Progress:
     before: wp.array[float]
     way: wp.array[float]
     way_before: wp.array[float]
+    fastest: wp.array[float]
     longest: wp.array[float]
     given_way: wp.array[float]
     remaining: wp.array[float]

@@ -29,13 +29,7 @@ class Elements:
             [capacity, 3 size, size] of vec3: row 3 i + j belongs to component j of the force on particle i.
     """
 
-    def __init__(
-        self,
-        kernel: wp.Kernel,
-        vertices: wp.array,
-        rows: wp.array,
-        jacobians: wp.Kernel | None = None,
-    ):
+    def __init__(self, kernel: wp.Kernel, vertices: wp.array, rows: wp.array, jacobians: wp.Kernel | None = None):
         """Allocates buffers for forces on ``vertices``.
 
         Args:
