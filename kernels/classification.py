@@ -6,7 +6,7 @@ from .bernstein import scaled_weights, split_cubic, split_quadratic
 from .closest import between, closest_coordinates
 from .culling import direction_separates
 from .polynomials import Coplanarity, InsideTests, Motion, inside_tests, largest_axis
-from .roots import TWO_EXTREMA, UNKNOWN, count_roots, curve_class, largest, quadratic_signs
+from .roots import MONOTONE, ONE_EXTREMUM, TWO_EXTREMA, UNKNOWN, count_roots, curve_class, largest, quadratic_signs
 from .signs import FREE, HIT, UNSURE, ZERO, certified_sign, certified_sign_cubic, certified_sign_quadratic
 
 TINY = wp.constant(wp.float64(2.0**-80))
@@ -43,27 +43,6 @@ def either(first: int, second: int) -> int:
 
 
 @wp.func
-def _classify_piece(k: wp.vec4d, bound: wp.float64, tests: InsideTests, shape: int) -> int:
-    """Returns the status over a time in which the cubic has at most one extremum."""
-    if certified_sign_cubic(k, bound) != 0:
-        return FREE
-    roots = count_roots(k, bound, shape)
-    if roots == 0:
-        return FREE
-    if roots == UNKNOWN:
-        return UNSURE
-    size = largest(k)
-    s0 = quadratic_signs(tests.q0, tests.bounds[0], k, bound, size, roots)
-    s1 = quadratic_signs(tests.q1, tests.bounds[1], k, bound, size, roots)
-    s2 = quadratic_signs(tests.q2, tests.bounds[2], k, bound, size, roots)
-    s3 = quadratic_signs(tests.q3, tests.bounds[3], k, bound, size, roots)
-    return either(
-        verdict(wp.vec4i(s0[0], s1[0], s2[0], s3[0])),
-        verdict(wp.vec4i(s0[1], s1[1], s2[1], s3[1])),
-    )
-
-
-@wp.func
 def _half(q: wp.vec3d, a: wp.float64, b: wp.float64, first: bool) -> wp.vec3d:
     """Returns one part of a quadratic split at t = a / (a + b)."""
     left, right = split_quadratic(q, a, b)
@@ -71,13 +50,59 @@ def _half(q: wp.vec3d, a: wp.float64, b: wp.float64, first: bool) -> wp.vec3d:
 
 
 @wp.func
-def classify_with(k: wp.vec4d, bound: wp.float64, tests: InsideTests) -> int:
-    """Returns the status of a query whose cubic may have roots, from the given inside tests.
+def _classify_part(k: wp.vec4d, bound: wp.float64, tests: InsideTests, shape: int, first: bool) -> int:
+    """Returns the status over the whole time, or over that before or after the inflection if there are two extrema.
 
     Bounds after splitting at weights with sum s, which count as exact: at most 10 roundings of coefficients of
     size s^3 k, below E s^3, so 2.5 s^3 E; likewise 2.5 s^2 F. The weights are scaled to 1 <= s < 4, so that these are
     no less than E and F, and cover underflow as well, as those do.
     """
+    part_k, part_bound, part_shape = k, bound, shape
+    part = InsideTests()
+    part.bounds = tests.bounds
+    part.q0 = tests.q0
+    part.q1 = tests.q1
+    part.q2 = tests.q2
+    part.q3 = tests.q3
+    if shape == TWO_EXTREMA:
+        a, b = scaled_weights(wp.abs((k[2] - k[1]) - (k[1] - k[0])), wp.abs((k[3] - k[2]) - (k[2] - k[1])))
+        square = (a + b) * (a + b)
+        part_bound = SPLIT_ERROR * square * (a + b) * bound
+        k_first, k_second = split_cubic(k, a, b)
+        part_k = wp.where(first, k_first, k_second)
+        part_shape = curve_class(part_k, part_bound)
+        part.bounds = SPLIT_ERROR * square * tests.bounds
+        part.q0 = _half(tests.q0, a, b, first)
+        part.q1 = _half(tests.q1, a, b, first)
+        part.q2 = _half(tests.q2, a, b, first)
+        part.q3 = _half(tests.q3, a, b, first)
+    if certified_sign_cubic(part_k, part_bound) != 0:
+        return FREE
+    if shape == TWO_EXTREMA:
+        if verdict(constant_signs(part)) == FREE:
+            return FREE
+        end_signs = certified_sign(part_k[0], part_bound) * certified_sign(part_k[3], part_bound)
+        if end_signs == 0 or (part_shape != MONOTONE and part_shape != ONE_EXTREMUM):
+            return UNSURE
+    roots = count_roots(part_k, part_bound, part_shape)
+    if roots == 0:
+        return FREE
+    if roots == UNKNOWN:
+        return UNSURE
+    size = largest(part_k)
+    s0 = quadratic_signs(part.q0, part.bounds[0], part_k, part_bound, size, roots)
+    s1 = quadratic_signs(part.q1, part.bounds[1], part_k, part_bound, size, roots)
+    s2 = quadratic_signs(part.q2, part.bounds[2], part_k, part_bound, size, roots)
+    s3 = quadratic_signs(part.q3, part.bounds[3], part_k, part_bound, size, roots)
+    return either(
+        verdict(wp.vec4i(s0[0], s1[0], s2[0], s3[0])),
+        verdict(wp.vec4i(s0[1], s1[1], s2[1], s3[1])),
+    )
+
+
+@wp.func
+def classify_with(k: wp.vec4d, bound: wp.float64, tests: InsideTests) -> int:
+    """Returns the status of a query whose cubic may have roots, from the given inside tests."""
     constant = verdict(constant_signs(tests))
     if constant == FREE:
         return FREE
@@ -87,35 +112,10 @@ def classify_with(k: wp.vec4d, bound: wp.float64, tests: InsideTests) -> int:
     shape = curve_class(k, bound)
     if end_signs == 0 or shape == UNKNOWN:
         return UNSURE
-    if shape != TWO_EXTREMA:
-        return _classify_piece(k, bound, tests, shape)
-
-    e0 = (k[2] - k[1]) - (k[1] - k[0])
-    e1 = (k[3] - k[2]) - (k[2] - k[1])
-    a, b = scaled_weights(wp.abs(e0), wp.abs(e1))
-    square = (a + b) * (a + b)
-    part_bound = SPLIT_ERROR * square * (a + b) * bound
-    k_first, k_second = split_cubic(k, a, b)
-    status = FREE
-    for piece in range(2):
-        first = piece == 0
-        part_k = wp.where(first, k_first, k_second)
-        part = InsideTests()
-        part.bounds = SPLIT_ERROR * square * tests.bounds
-        part.q0 = _half(tests.q0, a, b, first)
-        part.q1 = _half(tests.q1, a, b, first)
-        part.q2 = _half(tests.q2, a, b, first)
-        part.q3 = _half(tests.q3, a, b, first)
-        half_shape = curve_class(part_k, part_bound)
-        half = UNSURE
-        if certified_sign_cubic(part_k, part_bound) != 0 or verdict(constant_signs(part)) == FREE:
-            half = FREE
-        elif (
-            certified_sign(part_k[0], part_bound) * certified_sign(part_k[3], part_bound) != 0 and half_shape != UNKNOWN
-        ):
-            if half_shape != TWO_EXTREMA:
-                half = _classify_piece(part_k, part_bound, part, half_shape)
-        status = either(status, half)
+    status = int(FREE)
+    # a loop that is not unrolled: threads of a warp with one part and with two run the same code
+    for part in range(wp.where(shape == TWO_EXTREMA, 2, 1)):
+        status = either(status, _classify_part(k, bound, tests, shape, part == 0))
     return status
 
 
