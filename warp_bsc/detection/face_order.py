@@ -27,9 +27,6 @@ _AXES = wp.constant(wp.types.matrix(shape=(8, 2), dtype=int)(1, 0, 0, 1, 1, 1, 1
 _LARGE = wp.constant(4096)
 """Faces of a part that is split along the best of four axes instead of eight, which takes less time."""
 
-_HALVINGS = wp.constant(2)
-"""Times that a part is halved by the same coordinates."""
-
 
 @wp.struct
 class _Faces:
@@ -191,8 +188,8 @@ def _halve(faces: _Faces, begin: int, split: int, end: int):
 
 
 @wp.kernel(**NO_GRADIENTS)
-def _split_parts(first: int, faces: _Faces, parts: wp.array[wp.vec2i], stamp: int, split: wp.array2d[wp.vec2i]):
-    """Halves each part a few times, by the same coordinates; parts may be split at once, as no face is in two.
+def _halve_parts(first: int, faces: _Faces, parts: wp.array[wp.vec2i], stamp: int, splits: wp.array[int]):
+    """Orders each part by the half that its faces are in; parts may be halved at once, as no face is in two.
 
     A part has the places from the first to before the second of its numbers. ``stamp`` is :data:`_STAMPS` more than in
     the launch before.
@@ -211,18 +208,9 @@ def _split_parts(first: int, faces: _Faces, parts: wp.array[wp.vec2i], stamp: in
         faces.order[i] = face
         faces.u[face] = faces.distances[0, face] - faces.distances[1, face]
         faces.v[face] = faces.distances[2, face] - faces.distances[3, face]
-    split[part, 0] = parts[part]
-    count = int(1)
-    for _halving in range(_HALVINGS):
-        for k in range(count - 1, -1, -1):
-            start, stop = split[part, k][0], split[part, k][1]
-            middle = stop
-            if stop - start > CLUSTER:
-                middle = _split_at(start, stop)
-                _halve(faces, start, middle, stop)
-            split[part, 2 * k] = wp.vec2i(start, middle)
-            split[part, 2 * k + 1] = wp.vec2i(middle, stop)
-        count *= 2
+    split = _split_at(begin, end)
+    _halve(faces, begin, split, end)
+    splits[part] = split
 
 
 def _links(faces: np.ndarray) -> np.ndarray:
@@ -266,8 +254,8 @@ def order_faces(faces: np.ndarray, world: np.ndarray | None = None) -> np.ndarra
 
     Connectivity alone decides, so that the order stays good however the mesh moves. Each component is bisected until
     its parts fit in clusters. Breadth-first searches from four faces at its rim, far from one another, give each face
-    coordinates, the differences of its distances from two opposite ones, of which every second part gets new ones. Of
-    several directions in them the one is halved whose halves share the fewest edges. Time grows with ``n log n``.
+    coordinates, the differences of its distances from two opposite ones. Of several directions in these coordinates
+    the one is halved whose halves share the fewest edges. Time grows with ``n log n``.
 
     Args:
         faces: Vertex indices of the faces, int32, shape [face_count, 3].
@@ -307,9 +295,10 @@ def order_faces(faces: np.ndarray, world: np.ndarray | None = None) -> np.ndarra
     parts = np.stack([places[:-1], places[:-1] + sizes], axis=1)
     stamp = 1
     while len(parts := parts[parts[:, 1] - parts[:, 0] > CLUSTER]):
-        split = wp.empty((len(parts), 2**_HALVINGS), dtype=wp.vec2i, device="cpu")
+        splits = wp.empty(len(parts), dtype=int, device="cpu")
         inputs = [mesh, wp.array(parts.astype(np.int32), dtype=wp.vec2i, device="cpu"), stamp]
-        launch_over(_split_parts, len(parts), inputs=inputs, outputs=[split], device=wp.get_device("cpu"), chunk=1)
-        parts = split.numpy().reshape(-1, 2)
+        launch_over(_halve_parts, len(parts), inputs=inputs, outputs=[splits], device=wp.get_device("cpu"), chunk=1)
+        middle = splits.numpy()
+        parts = np.concatenate([np.stack([parts[:, 0], middle], axis=1), np.stack([middle, parts[:, 1]], axis=1)])
         stamp += _STAMPS
     return np.where((order := mesh.order.numpy()) < 0, -1, face_of[order])
