@@ -29,7 +29,7 @@ from warp_bsc.scene_replay import checking, worker, workers
 
 FILES = {"--json": "hits.json", "--csv": "hits.csv", "--overlay": "overlay.usdc", "--report": "page.html"}
 FILES["--npz"] = "hits.npz"
-FRAMES, SIDE = 24, 5
+FRAMES, SIDE = 24, 3
 
 
 def add_sheet(stage, name, lag, broken=None):
