@@ -11,6 +11,7 @@ from benchmark_data import data_folder
 from chromium import CHROMIUM
 from compilation import compile_for_gpus, compile_kernels_once, compile_quickly
 from guarded_memory import guard_memory
+from sample_sizes import choose
 from sanitized_kernels import SANITIZED, restart_with_sanitizers, sanitize_kernels, sanitizers_available
 
 import warp_bsc.usd.scene  # noqa: F401 (before OpenUSD, which reads the variables that it sets: no mapped files)
@@ -36,6 +37,7 @@ def pytest_addoption(parser):
 
 def pytest_configure(config):
     """Sets what must be set before any kernel is loaded or array made, and signals as a terminal has them."""
+    choose(config.getoption("-m"))
     for name, handler in (("SIGINT", signal.default_int_handler), ("SIGHUP", signal.SIG_DFL)):
         number = getattr(signal, name, None)  # Windows has no SIGHUP
         if number and signal.getsignal(number) == signal.SIG_IGN:  # as a shell has it for programs in the background

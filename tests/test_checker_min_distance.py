@@ -9,6 +9,7 @@ import pytest
 from generators import GENERATORS
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sample_sizes import cases
 
 from warp_bsc import checker
 from warp_bsc.checker import queries
@@ -51,7 +52,7 @@ def lattice(kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 @given(data=st.data(), exponent=st.integers(-1020, 1000))
-@settings(max_examples=25)
+@settings(max_examples=cases(25))
 def test_lattice(kind, data, exponent):
     """Integer coordinates, whose distances are often exactly the one asked for, at any scale."""
     points = data.draw(lattice(kind))
@@ -97,7 +98,7 @@ def test_filter_agrees_with_exact_arithmetic(kind):
     st.floats(-1e290, 1e290),
     st.sampled_from([(0.0, 0.0), (1.0, 0.5), (1.0, 0.0)]),
 )
-@settings(max_examples=20)
+@settings(max_examples=cases(20))
 def test_time_of_a_fall_to_a_distance(distance, start, end, foot):
     """A point that falls onto the plane, a side or a corner of a face, straight down."""
     side = 1e291

@@ -9,6 +9,7 @@ import warp as wp
 from generators import GENERATORS, grazing, mostly_hits, one_ulp_apart, touching, uniform
 from impacts import impact_kernel
 from outputs import filled_with_nan
+from sample_sizes import cases
 
 import warp_bsc as bsc
 from warp_bsc import checker
@@ -170,7 +171,7 @@ def test_no_contact_is_before_the_time_of_impact(kind, dtype):
     tolerance = 2.0**-12
     for name, generator in GENERATORS.items():
         rng = np.random.default_rng([3, *name.encode()])
-        points = generator(rng, 40 if "scales" in name or "huge" in name else 100, kind, dtype)
+        points = generator(rng, cases(40 if "scales" in name or "huge" in name else 100), kind, dtype)
         times = TRUTH[kind](points)
         found = impacts(kind, points, tolerance)
         contact = found.status != FREE

@@ -11,6 +11,7 @@ from generators import GENERATORS, _weights, _with_gap
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from sample_sizes import cases
 from test_wide_integers import to_integers
 
 import warp_bsc as bsc
@@ -70,15 +71,15 @@ def turning_planes(rng, n, kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_motion_in_a_turning_plane(kind):
-    points = turning_planes(np.random.default_rng(3), 600, kind)
+    points = turning_planes(np.random.default_rng(3), cases(600), kind)
     truth = getattr(checker, kind)(points)
-    assert 100 < truth.sum() < 500
+    assert cases(100) < truth.sum() < cases(500)
     for limbs in BITS:
         assert_true(kind, points, limbs)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@settings(max_examples=25)
+@settings(max_examples=cases(25))
 @given(
     coordinates=arrays(np.int64, (40, 8, 3), elements=st.integers(-3, 3)),
     axes=st.permutations(range(3)),

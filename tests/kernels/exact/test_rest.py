@@ -7,6 +7,7 @@ import pytest
 import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sample_sizes import cases
 
 from warp_bsc import checker
 from warp_bsc.kernels.exact.rest import meet_at_rest
@@ -60,7 +61,7 @@ def test_almost_degenerate(size, device):
     assert check(points, device) > 20
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=cases(50), deadline=None)
 @given(st.lists(st.floats(width=32, allow_nan=False, allow_infinity=False), min_size=12, max_size=12))
 def test_any_numbers(values):
     check(np.reshape(values, (1, 4, 3)), "cpu")

@@ -90,7 +90,7 @@ def fall(model, solver, steps):
     [
         ("vbd", 0.2, "lagged", 1),
         pytest.param("vbd", 0.2, "staggered", 1, marks=pytest.mark.slow),
-        ("xpbd", 0.02, "lagged", 2),
+        pytest.param("xpbd", 0.02, "lagged", 2, marks=pytest.mark.slow),
     ],
 )
 def test_a_proxy_flies_as_a_body_of_the_inner_solver_does(inner, mass, mode, iterations, device):
@@ -137,7 +137,7 @@ def test_a_step_is_certified_in_the_state_of_the_program(mode, iterations, mass,
     np.testing.assert_array_equal(rollout.states[0].body_q.numpy()[0], expected[-1])
 
 
-@pytest.mark.parametrize("mode", ["lagged", "staggered"])
+@pytest.mark.parametrize("mode", [pytest.param("lagged", marks=pytest.mark.slow), "staggered"])
 def test_a_stage_around_the_coupled_solver_keeps_the_state_of_the_program_free(mode, device, recwarn):
     """Where the stage in the entry alone does not; the ball still feels the sheet."""
     model = ball_over_sheet(device)
@@ -349,7 +349,7 @@ def test_a_captured_graph_steps_as_the_solver_does(device):
     np.testing.assert_array_equal(*ends)
 
 
-@pytest.mark.parametrize("iterations", [1, 2])
+@pytest.mark.parametrize("iterations", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_what_two_entries_pass_of_each_other_is_met_in_the_next_step(iterations, device):
     """Each entry sees the other at its start: two patches swap sides in a step, and are pushed back in the next."""
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
