@@ -43,7 +43,7 @@ def assert_true(kind, points, limbs, *, least=1.0):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", GENERATORS)
 def test_answers_are_true_in_every_width(name, kind, dtype):
-    count = 8 if name == "subnormal_and_huge" else 40
+    count = cases(8 if name == "subnormal_and_huge" else 40)
     points = GENERATORS[name](np.random.default_rng([13, *name.encode()]), count, kind, dtype)
     for limbs in BITS:
         assert_true(kind, points, limbs, least=1.0 if dtype == np.float32 and limbs == 8 else 0.0)
@@ -322,8 +322,8 @@ def widest_queries(rng, n, kind, limbs):
 def test_no_number_exceeds_its_bound(kind, limbs):
     rng = np.random.default_rng(limbs)
     names = [name for name in GENERATORS if name != "subnormal_and_huge"]
-    points = [GENERATORS[name](rng, 150, kind, np.float64) for name in names]
-    points = np.concatenate([*points, widest_queries(rng, 4000, kind, limbs)])
+    points = [GENERATORS[name](rng, cases(150), kind, np.float64) for name in names]
+    points = np.concatenate([*points, widest_queries(rng, cases(4000), kind, limbs)])
     _, bits = decide_exactly(kind, points, limbs)
     points, bits = points[bits <= BITS[limbs]], bits[bits <= BITS[limbs]]
     assert bits.max() == BITS[limbs]
