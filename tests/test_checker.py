@@ -93,7 +93,7 @@ def test_time_of_a_fall_onto_a_face(start, end):
 @pytest.mark.parametrize("name", GENERATORS)
 def test_filter_agrees_with_exact_arithmetic(kind, name, monkeypatch):
     for dtype in (np.float32, np.float64):
-        points = GENERATORS[name](np.random.default_rng(6), 30, kind, dtype)
+        points = GENERATORS[name](np.random.default_rng(6), cases(30), kind, dtype)
         monkeypatch.undo()
         filtered = COLLIDES[kind](points)
         monkeypatch.setattr(
@@ -162,7 +162,7 @@ def test_invariance_of_any_floats(kind, data):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", GENERATORS)
 def test_invariance_of_adversarial_queries(kind, name):
-    points = GENERATORS[name](np.random.default_rng(8), 20, kind, np.float32)
+    points = GENERATORS[name](np.random.default_rng(8), cases(20), kind, np.float32)
     answers = COLLIDES[kind](np.concatenate([relatives(kind, query) for query in points.astype(np.float64)]))
     assert np.array_equal(answers.reshape(len(points), -1).all(axis=1), answers.reshape(len(points), -1).any(axis=1))
 

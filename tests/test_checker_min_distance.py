@@ -23,7 +23,7 @@ TOI = {kind: getattr(checker, f"{kind}_toi") for kind in KINDS}
 @pytest.mark.parametrize("kind", KINDS)
 def test_distance_that_is_reached_exactly_decides_to_the_last_bit(kind):
     rng = np.random.default_rng(1)
-    points, distance = distances.reached(rng, 250, kind)
+    points, distance = distances.reached(rng, cases(250), kind)
     distance, truth = distances.nudged(rng, distance)
     points, distance = distances.scaled(rng, points, distance)
     assert 0.3 < truth.mean() < 0.9
@@ -72,7 +72,7 @@ def test_lattice(kind, data, exponent):
 @pytest.mark.parametrize("kind", ["vertex_face", "edge_edge"])
 @pytest.mark.parametrize("name", ["integer_lattice", "collapsing", "coplanar", "grazing"])
 def test_distance_of_zero_is_contact_in_its_own_polynomials_too(kind, name):
-    points = GENERATORS[name](np.random.default_rng(3), 40, kind, np.float64)
+    points = GENERATORS[name](np.random.default_rng(3), cases(40), kind, np.float64)
     shapes = list(queries.polygons(points, queries.POLYGONS[kind], np.zeros(len(points))))
     collides = queries.collides(shapes, np.zeros(len(points), dtype=bool))
     assert collides.sum() > 0
@@ -83,7 +83,7 @@ def test_distance_of_zero_is_contact_in_its_own_polynomials_too(kind, name):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_filter_agrees_with_exact_arithmetic(kind):
-    points, distance = distances.adversarial(np.random.default_rng(4), 120, kind)
+    points, distance = distances.adversarial(np.random.default_rng(4), cases(120), kind)
     shapes = queries.polygons(points, queries.POLYGONS[kind], distance)
     exact = queries.collides(shapes, np.zeros(len(points), dtype=bool))
     near, hit = polygons_near(points, queries.POLYGONS[kind], distance)
