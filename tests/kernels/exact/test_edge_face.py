@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import warp as wp
-from sample_sizes import cases
 
 from warp_bsc import checker
 from warp_bsc.kernels import FREE, HIT, UNSURE
@@ -98,12 +97,12 @@ SOURCES = {
 @pytest.mark.parametrize("source", SOURCES)
 def test_answers_are_those_of_the_checker(source, limbs):
     rng = np.random.default_rng([1, *source.encode()])
-    points = SOURCES[source](rng, cases(600))
+    points = SOURCES[source](rng, 600)
     status, expected = decide(points, limbs), truth(points)
     decided = status != UNSURE
     assert decided.mean() > (0.05 if source == "wide" else 0.99)
     np.testing.assert_array_equal(status[decided], expected[decided])
-    assert (expected == TOUCHES).sum() > cases(20)
+    assert (expected == TOUCHES).sum() > 20
 
 
 @pytest.mark.parametrize("limbs", BITS)

@@ -71,7 +71,7 @@ def assert_true(kind, points, distance, *, decided=0.0, limbs=tuple(BITS)):
 @pytest.mark.parametrize("kind", distances.KINDS)
 def test_no_answer_is_untrue(kind):
     rng = np.random.default_rng([2, *kind.encode()])
-    points, distance = distances.reached(rng, cases(150), kind)
+    points, distance = distances.reached(rng, 50 + cases(100), kind)
     distance, truth = distances.nudged(rng, distance)
     points, distance = distances.scaled(rng, points, distance, -40, 40)
     np.testing.assert_array_equal(assert_true(kind, points, distance, decided=0.4), truth)

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import warp as wp
 from generators import GENERATORS
-from sample_sizes import cases
 
 import warp_bsc as bsc
 from warp_bsc import checker
@@ -72,7 +71,7 @@ def near_misses(random, points, kind):
 def test_what_is_culled_keeps_its_distance(kind, dtype):
     random = np.random.default_rng(8)
     names = [name for name in GENERATORS if name != "subnormal_and_huge"]  # out of the range of distances
-    points = np.concatenate([GENERATORS[name](random, cases(41), kind, dtype) for name in names])
+    points = np.concatenate([GENERATORS[name](random, 41, kind, dtype) for name in names])
     deviation, distance = near_misses(random, points, kind)
     left = cull(kind, points, deviation)
     culled = np.flatnonzero(~left)
