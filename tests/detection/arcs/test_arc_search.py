@@ -326,7 +326,7 @@ def test_a_body_collides_with_what_is_tied_to_it(device, broad_phase):
     np.testing.assert_allclose(found.vertex_face_toi, 0.5, atol=0.02)
 
 
-@pytest.mark.parametrize("angle", [0.5, 2.0])
+@pytest.mark.parametrize("angle", [0.5, pytest.param(2.0, marks=pytest.mark.slow)])
 def test_pairs_within_a_body_that_deforms_are_looked_at(angle, device):
     """Along the axis deformations turn into themselves: pairs collide as on straight paths in the frame of the body."""
     rng = np.random.default_rng(int(angle))
