@@ -378,9 +378,9 @@ def test_layers_keep_their_own_distances(dtype):
     for inner, outer in ((0, 1), (1, 2), (0, 2)):
         for points, triangles in ((inner, outer), (outer, inner)):
             corners = result.x[ball.faces + triangles * count].astype(float)
-            x = np.repeat(result.x[points * count : (points + 1) * count].astype(float), NEAREST, axis=0)
-            near = KDTree(corners.mean(axis=1)).query(x[::NEAREST], NEAREST)[1].ravel()
-            distance = np.linalg.norm(trimesh.triangles.closest_point(corners[near], x) - x, axis=1).min()
+            at = np.repeat(result.x[points * count : (points + 1) * count].astype(float), NEAREST, axis=0)
+            near = KDTree(corners.mean(axis=1)).query(at[::NEAREST], NEAREST)[1].ravel()
+            distance = np.linalg.norm(trimesh.triangles.closest_point(corners[near], at) - at, axis=1).min()
             least[inner, outer] = min(distance, least.get((inner, outer), np.inf))
     assert 0.002 < least[0, 1] < 0.0022 and 0.005 < least[1, 2] < 0.0052 and least[0, 2] > 0.003
     # without radii, or with one distance for all, they are other ones
