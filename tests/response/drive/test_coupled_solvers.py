@@ -17,7 +17,6 @@ from newton_versions import needs_attachments
 import warp_bsc as bsc
 from warp_bsc.response.drive import coupling
 
-
 STEPS = 28
 """Of a ball that flies at a sheet, as far as it takes to be stopped or to pass."""
 
