@@ -9,7 +9,8 @@ import pytest
 from warp_bsc._profiling import VARIABLE, phase
 
 PROGRAM = """
-import sys, types
+import gc, sys, types
+gc.disable()  # as conftest.py does while it imports
 names = []
 nvtx = types.ModuleType("nvtx")
 nvtx.start_range = lambda name, **_: names.append(name)
