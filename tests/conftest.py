@@ -11,6 +11,7 @@ from benchmark_data import data_folder
 from chromium import CHROMIUM
 from compilation import compile_for_gpus, compile_kernels_once, compile_quickly
 from guarded_memory import guard_memory
+from sample_sizes import cases, choose
 from sanitized_kernels import SANITIZED, restart_with_sanitizers, sanitize_kernels, sanitizers_available
 
 import warp_bsc.usd.scene  # noqa: F401 (before OpenUSD, which reads the variables that it sets: no mapped files)
@@ -19,9 +20,7 @@ gc.disable()  # until all tests are collected: each collection would look at all
 wp.config.log_level = wp.LOG_WARNING
 wp.init()
 compile_kernels_once()
-hypothesis.settings.register_profile("repeatable", derandomize=True, deadline=None, max_examples=30)
 hypothesis.settings.register_profile("new", deadline=None, max_examples=300)  # each night: --hypothesis-profile=new
-hypothesis.settings.load_profile("repeatable")
 
 
 def pytest_addoption(parser):
@@ -36,6 +35,10 @@ def pytest_addoption(parser):
 
 def pytest_configure(config):
     """Sets what must be set before any kernel is loaded or array made, and signals as a terminal has them."""
+    choose(config.getoption("-m"))
+    if not config.getoption("--hypothesis-profile"):
+        hypothesis.settings.register_profile("repeatable", derandomize=True, deadline=None, max_examples=cases(30))
+        hypothesis.settings.load_profile("repeatable")
     for name, handler in (("SIGINT", signal.default_int_handler), ("SIGHUP", signal.SIG_DFL)):
         number = getattr(signal, name, None)  # Windows has no SIGHUP
         if number and signal.getsignal(number) == signal.SIG_IGN:  # as a shell has it for programs in the background

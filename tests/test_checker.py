@@ -12,6 +12,7 @@ from checker_functions import COLLIDES, KINDS, TOI
 from generators import GENERATORS, exact_contacts
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sample_sizes import cases
 
 from warp_bsc import checker
 from warp_bsc.checker.filters import triangles_may_touch
@@ -73,7 +74,7 @@ def test_one_ulp_of_height_decides(kind, dtype):
 
 
 @given(st.floats(0, 1.7e308, exclude_min=True), st.floats(-1.7e308, 0, exclude_max=True))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=cases(60), deadline=None)
 def test_time_of_a_fall_onto_a_face(start, end):
     side = 1e300
     face = [[-side, -side, 0], [side, -side, 0], [0, side, 0]]
@@ -92,7 +93,7 @@ def test_time_of_a_fall_onto_a_face(start, end):
 @pytest.mark.parametrize("name", GENERATORS)
 def test_filter_agrees_with_exact_arithmetic(kind, name, monkeypatch):
     for dtype in (np.float32, np.float64):
-        points = GENERATORS[name](np.random.default_rng(6), 30, kind, dtype)
+        points = GENERATORS[name](np.random.default_rng(6), cases(30), kind, dtype)
         monkeypatch.undo()
         filtered = COLLIDES[kind](points)
         monkeypatch.setattr(
@@ -139,7 +140,7 @@ def queries(elements):
 @given(
     points=queries(st.integers(-2, 2)), shift=st.tuples(*[st.integers(-9, 9)] * 3), exponent=st.integers(-1070, 1000)
 )
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=cases(100), deadline=None)
 def test_invariance_of_lattice_queries(kind, points, shift, exponent):
     moved = np.array(
         [points + np.array(shift), np.ldexp(points, exponent), np.ldexp(points + np.array(shift), exponent)]
@@ -150,7 +151,7 @@ def test_invariance_of_lattice_queries(kind, points, shift, exponent):
 
 @pytest.mark.parametrize("kind", KINDS)
 @given(data=st.data())
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=cases(20), deadline=None)
 def test_invariance_of_any_floats(kind, data):
     largest = data.draw(st.sampled_from([1.0, 4.0, 1e30, 1.7e308]))
     points = data.draw(queries(st.floats(-largest, largest) | st.sampled_from([0.0, 1.0, 0.1, 1.0 - 2.0**-53])))
@@ -161,7 +162,7 @@ def test_invariance_of_any_floats(kind, data):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", GENERATORS)
 def test_invariance_of_adversarial_queries(kind, name):
-    points = GENERATORS[name](np.random.default_rng(8), 20, kind, np.float32)
+    points = GENERATORS[name](np.random.default_rng(8), cases(20), kind, np.float32)
     answers = COLLIDES[kind](np.concatenate([relatives(kind, query) for query in points.astype(np.float64)]))
     assert np.array_equal(answers.reshape(len(points), -1).all(axis=1), answers.reshape(len(points), -1).any(axis=1))
 

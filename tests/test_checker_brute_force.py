@@ -9,6 +9,7 @@ import pytest
 from checker_functions import COLLIDES, KINDS, TOI
 from exact_vectors import along, cross, dot, minus
 from generators import GENERATORS
+from sample_sizes import cases
 
 # Nothing here is shared with the checker: polynomials come from interpolation, roots from bisection between roots of
 # the derivative, contact from the distance of closest points. Between small integers no distance is tiny but not zero;
@@ -145,14 +146,14 @@ def assert_brute_force_agrees(kind, points):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("size", [1, 2])
 def test_brute_force_on_lattice(kind, size):
-    points = np.random.default_rng(size).integers(-size, size + 1, (100, 8, 3)).astype(np.float64)
+    points = np.random.default_rng(size).integers(-size, size + 1, (cases(100), 8, 3)).astype(np.float64)
     assert 0 < assert_brute_force_agrees(kind, points) < len(points)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("dimensions", [1, 2])
 def test_brute_force_on_coplanar_lattice(kind, dimensions):
-    points = np.random.default_rng(dimensions).integers(-2, 3, (100, 8, 3)).astype(np.float64)
+    points = np.random.default_rng(dimensions).integers(-2, 3, (20 + cases(80), 8, 3)).astype(np.float64)
     points[..., dimensions:] = 0.0
     assert 0 < assert_brute_force_agrees(kind, points) < len(points)
 
@@ -160,5 +161,5 @@ def test_brute_force_on_coplanar_lattice(kind, dimensions):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", ["collapsing", "touching", "resting_contact"])
 def test_brute_force_on_degenerate_lattice(kind, name):
-    points = GENERATORS[name](np.random.default_rng(3), 60, kind, np.float64)
+    points = GENERATORS[name](np.random.default_rng(3), cases(60), kind, np.float64)
     assert assert_brute_force_agrees(kind, points) > 0

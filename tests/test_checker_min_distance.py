@@ -9,6 +9,7 @@ import pytest
 from generators import GENERATORS
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sample_sizes import cases
 
 from warp_bsc import checker
 from warp_bsc.checker import queries
@@ -22,7 +23,7 @@ TOI = {kind: getattr(checker, f"{kind}_toi") for kind in KINDS}
 @pytest.mark.parametrize("kind", KINDS)
 def test_distance_that_is_reached_exactly_decides_to_the_last_bit(kind):
     rng = np.random.default_rng(1)
-    points, distance = distances.reached(rng, 250, kind)
+    points, distance = distances.reached(rng, cases(250), kind)
     distance, truth = distances.nudged(rng, distance)
     points, distance = distances.scaled(rng, points, distance)
     assert 0.3 < truth.mean() < 0.9
@@ -51,7 +52,7 @@ def lattice(kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 @given(data=st.data(), exponent=st.integers(-1020, 1000))
-@settings(max_examples=25)
+@settings(max_examples=cases(25))
 def test_lattice(kind, data, exponent):
     """Integer coordinates, whose distances are often exactly the one asked for, at any scale."""
     points = data.draw(lattice(kind))
@@ -71,7 +72,7 @@ def test_lattice(kind, data, exponent):
 @pytest.mark.parametrize("kind", ["vertex_face", "edge_edge"])
 @pytest.mark.parametrize("name", ["integer_lattice", "collapsing", "coplanar", "grazing"])
 def test_distance_of_zero_is_contact_in_its_own_polynomials_too(kind, name):
-    points = GENERATORS[name](np.random.default_rng(3), 40, kind, np.float64)
+    points = GENERATORS[name](np.random.default_rng(3), cases(40), kind, np.float64)
     shapes = list(queries.polygons(points, queries.POLYGONS[kind], np.zeros(len(points))))
     collides = queries.collides(shapes, np.zeros(len(points), dtype=bool))
     assert collides.sum() > 0
@@ -82,7 +83,7 @@ def test_distance_of_zero_is_contact_in_its_own_polynomials_too(kind, name):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_filter_agrees_with_exact_arithmetic(kind):
-    points, distance = distances.adversarial(np.random.default_rng(4), 120, kind)
+    points, distance = distances.adversarial(np.random.default_rng(4), cases(120), kind)
     shapes = queries.polygons(points, queries.POLYGONS[kind], distance)
     exact = queries.collides(shapes, np.zeros(len(points), dtype=bool))
     near, hit = polygons_near(points, queries.POLYGONS[kind], distance)
@@ -97,7 +98,7 @@ def test_filter_agrees_with_exact_arithmetic(kind):
     st.floats(-1e290, 1e290),
     st.sampled_from([(0.0, 0.0), (1.0, 0.5), (1.0, 0.0)]),
 )
-@settings(max_examples=20)
+@settings(max_examples=cases(20))
 def test_time_of_a_fall_to_a_distance(distance, start, end, foot):
     """A point that falls onto the plane, a side or a corner of a face, straight down."""
     side = 1e291

@@ -8,14 +8,19 @@ import ast
 import collections
 import functools
 import itertools
+import re
 import tomllib
 from pathlib import Path
 
 import pytest
-from test_package import circles, imports
+from test_package import circles, imports, statements
 
 ROOT = Path(__file__).parents[1]
 LIMITS = Path(__file__).with_name("form.toml")
+PRIVATE = re.compile(r"[\s.(,]_(?!_)\w")
+"""What a text has that takes a private name."""
+OWN = "self", "cls", "wp", "os"
+"""Objects whose private names a test may take."""
 
 
 def sources(root, *folders, ending="py"):
@@ -77,11 +82,12 @@ def functions_of(root):
     """
     for path in sources(root, "kernels", "warp_bsc"):
         text = path.read_text(encoding="utf-8")
-        for node in ast.walk(ast.parse(text)):
+        lines = text.splitlines()
+        for node in statements(ast.parse(text)):
             if isinstance(node, ast.FunctionDef):
                 count = sum(isinstance(child, ast.arg) for child in ast.walk(node.args))
                 is_kernel = any(ast.unparse(each).split("(")[0].endswith("kernel") for each in node.decorator_list)
-                signature = text.splitlines()[node.lineno : node.body[0].lineno - 1]
+                signature = lines[node.lineno : node.body[0].lineno - 1]
                 grouped = any(line.strip().startswith("#") for line in signature)
                 yield f"{path.relative_to(root).as_posix()}:{node.name}", count, is_kernel and not grouped
 
@@ -90,9 +96,11 @@ def private_accesses(root):
     """For each test file how often it takes a private name of our objects or modules."""
     found = collections.Counter()
     for path in sources(root, "tests"):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        text = path.read_text(encoding="utf-8")
+        for node in ast.walk(ast.parse(text)) if PRIVATE.search(text) else ():
             if isinstance(node, ast.Attribute):
-                names = [node.attr] if ast.unparse(node.value).split(".")[0] not in ("self", "cls", "wp", "os") else []
+                private = node.attr.startswith("_")  # else spared the cost of its text
+                names = [node.attr] if private and ast.unparse(node.value).split(".")[0] not in OWN else []
             else:
                 ours = isinstance(node, ast.ImportFrom) and (node.module or "").startswith("warp_bsc")
                 names = [alias.name for alias in node.names] if ours else []

@@ -178,6 +178,14 @@ LIBRARIES = {
 """Who may import a library: packages, or single files."""
 
 
+def statements(node):
+    """All statements within a node, and what has statements of its own, but no expressions."""
+    for part in ("body", "orelse", "finalbody", "handlers", "cases"):
+        for child in getattr(node, part, []):
+            yield child
+            yield from statements(child)
+
+
 @functools.cache
 def imports(root=ROOT):
     """Every import of our sources: file, package, names of the imported module (ours begin with "warp_bsc")."""
@@ -187,7 +195,7 @@ def imports(root=ROOT):
             relative = path.relative_to(folder)
             inside = ["warp_bsc", *(["kernels"] if folder.name == "kernels" else []), *relative.with_suffix("").parts]
             package = inside[1]
-            for node in ast.walk(ast.parse(path.read_text())):
+            for node in statements(ast.parse(path.read_text())):
                 if isinstance(node, ast.Import):
                     modules = [alias.name.split(".") for alias in node.names]
                 elif isinstance(node, ast.ImportFrom):

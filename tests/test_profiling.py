@@ -4,8 +4,13 @@ import os
 import subprocess
 import sys
 
+import pytest
+
+from warp_bsc._profiling import VARIABLE, phase
+
 PROGRAM = """
-import sys, types
+import gc, sys, types
+gc.disable()  # as conftest.py does while it imports
 names = []
 nvtx = types.ModuleType("nvtx")
 nvtx.start_range = lambda name, **_: names.append(name)
@@ -31,14 +36,16 @@ print(*dict.fromkeys(names), sep="\\n")
 
 
 def test_a_profile_reads_as_the_phases_of_a_step():
-    def run(value):
-        environment = os.environ | {"WARP_BSC_PROFILE": value}
-        done = subprocess.run(
-            [sys.executable, "-c", PROGRAM], env=environment, capture_output=True, text=True, check=True
-        )
-        return [line.removeprefix("warp_bsc: ") for line in done.stdout.splitlines() if line.startswith("warp_bsc: ")]
-
-    phases = run("1")
+    environment = os.environ | {VARIABLE: "1"}
+    done = subprocess.run([sys.executable, "-c", PROGRAM], env=environment, capture_output=True, text=True, check=True)
+    phases = [line.removeprefix("warp_bsc: ") for line in done.stdout.splitlines() if line.startswith("warp_bsc: ")]
     assert phases[:3] == ["inner solver", "begin", "detect contacts"]
     assert {"add proximities", "project velocities"} <= set(phases)
-    assert run("0") == []
+
+
+@pytest.mark.parametrize("value", ["0", None])
+def test_without_the_variable_functions_are_themselves(monkeypatch, value):
+    monkeypatch.delenv(VARIABLE, raising=False)
+    if value:
+        monkeypatch.setenv(VARIABLE, value)
+    assert phase("begin")(abs) is abs

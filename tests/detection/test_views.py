@@ -4,6 +4,7 @@ import newton
 import numpy as np
 import pytest
 import warp as wp
+from sample_sizes import cases
 
 import warp_bsc as bsc
 
@@ -56,7 +57,7 @@ def found(collisions):
 def test_collisions_of_views_are_those_of_copies(view, method, dtype, device):
     rng = np.random.default_rng(3)
     collisions = 0
-    for _ in range(20):
+    for _ in range(cases(20)):
         x0 = rng.uniform(-1.0, 1.0, (14, 3)).astype(dtype)
         x1 = x0 + rng.uniform(-0.5, 0.5, (14, 3)).astype(dtype)
         faces = rng.permuted(np.tile(np.arange(14), (10, 1)), axis=1)[:, :3]
@@ -68,7 +69,7 @@ def test_collisions_of_views_are_those_of_copies(view, method, dtype, device):
                 np.testing.assert_array_equal(actual[name], values)
         np.testing.assert_array_equal(detector.find_intersections(view(x1, device)), detector.find_intersections(x1))
         collisions += len(expected["vertex_face"]) + len(expected["edge_edge"])
-    assert collisions > 100
+    assert collisions > cases(100)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

@@ -212,7 +212,11 @@ def test_sheets_that_hit_each_other_where_single_vertices_are_cut_have_their_bar
     assert np.abs(states[0].particle_qd.numpy()).max() < 0.05
 
 
-@pytest.mark.parametrize(("gap", "speed"), [(0.006, 0.5), (0.006, 1.5), (0.008, 1.0), (0.008, 2.0), (0.01, 3.0)])
+FALLS = [(0.006, 1.5), (0.008, 1.0)]
+FALLS += [pytest.param(*each, marks=pytest.mark.slow) for each in ((0.006, 0.5), (0.008, 2.0), (0.01, 3.0))]
+
+
+@pytest.mark.parametrize(("gap", "speed"), FALLS)
 def test_sheets_that_fall_together_do_not_meet_where_one_is_cut(gap, speed, device):
     """Their ways are the same as long as all take the same part; one that takes less of its own is in the way."""
     solver = bsc.SolverImplicit(sheets(device, 0.04, gap, speed))

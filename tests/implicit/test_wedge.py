@@ -66,7 +66,9 @@ def vertices_inside(state, plates):
 
 
 @pytest.mark.filterwarnings("ignore:.*not certified", "ignore:edges pass", "ignore:.*strained")
-@pytest.mark.parametrize("angle", [0.0, np.radians(35.0)], ids=["parallel", "wedge"])
+@pytest.mark.parametrize(
+    "angle", [pytest.param(0.0, marks=pytest.mark.slow), np.radians(35.0)], ids=["parallel", "wedge"]
+)
 def test_what_is_squeezed_is_named_and_does_not_explode(angle, device):
     model = build(angle, device)
     solver, energy = bsc.SolverImplicit(model, report=["worlds"]), ElasticEnergy(model)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import warp as wp
 from outputs import filled_with_nan
+from sample_sizes import cases
 from sheets import crumpled
 
 import warp_bsc as bsc
@@ -63,7 +64,7 @@ def exceeds(least, direction, distance):
 def test_cleared_times_are_certified(kind, device):
     """The distance is the one along the direction at the start, or more or less by 2^-53 to 2^-30 of it, or a half."""
     rng = np.random.default_rng(3)
-    n = 400
+    n = cases(400)
     points = rng.standard_normal((n, 8, 3)) * 10.0 ** rng.uniform(-3, 3, (n, 8, 1))
     points[: n // 2, 4:] = points[: n // 2, :4] + 1e-3 * rng.standard_normal((n // 2, 4, 3))
     start = np.floor(rng.uniform(0, 1, n) * 2.0**40) * 2.0**-40
@@ -93,7 +94,7 @@ def test_cleared_times_are_certified(kind, device):
         for i in np.flatnonzero(advanced[name]):
             for time in (start[i], found[i]):
                 assert exceeds(least_along(ends[i], direction[i], float(time)), direction[i], float(distance[i]))
-    assert 20 < advanced["near"].sum() < n // 2 < advanced["half"].sum()
+    assert cases(20) < advanced["near"].sum() < n // 2 < advanced["half"].sum()
     assert not (advanced["near"] & (near > reached)).any()
 
 

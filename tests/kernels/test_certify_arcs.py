@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from arc_intervals import FREE, HIT, decide_by_mpmath, decide_by_numpy
 from certify_arcs import GENERATORS, KINDS, certify
+from sample_sizes import cases
 
 
 def test_no_collision_on_arcs_is_missed_and_nothing_farther_apart_than_the_tolerance_is_reported(device):
-    searches, detections = certify(1600, 5, device, of_detector=10)
+    searches, detections = certify(cases(1600), 5, device, of_detector=10)
     for name, verdict in searches.items():
         assert (verdict.missed, verdict.late, verdict.beyond, verdict.undecided) == (0, 0, 0, 0), (name, verdict)
         assert verdict.colliding > 0 and verdict.unsure == 0

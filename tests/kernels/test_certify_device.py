@@ -22,6 +22,7 @@ from certify_totals import METHODS, Result
 from device_queries import LATTICE, Generator, make_lattice_queries
 from lattice_truth import LARGEST, decide_lattice
 from rich.console import Console
+from sample_sizes import cases
 
 from warp_bsc import checker
 from warp_bsc.kernels import ccd, classification
@@ -89,7 +90,7 @@ def all_jobs():
 
 
 def test_nothing_contradicts_the_truth(all_jobs, device):
-    failures, printed = run(all_jobs, device, one_in=50)
+    failures, printed = run(all_jobs, device, one_in=50 * 100 // cases(100))
     assert failures == 0, printed
     assert "0 failures" in printed
     wrong = dict(re.findall(r"^(float|conservative|user's kernel|exact) .* ([\d,]+ +[\d,]+) *$", printed, re.MULTILINE))

@@ -13,6 +13,7 @@ import warp as wp
 from compilation import QUICK
 from generators import GENERATORS, mostly_hits, uniform
 from outputs import filled_with_nan
+from sample_sizes import cases
 
 import warp_bsc as bsc
 from warp_bsc import checker
@@ -129,7 +130,7 @@ def test_culls_and_certified_answers_are_true(kind, dtype):
     """Also along directions that are aimed at: a normal at the start, rounded, of any length."""
     for name, generator in GENERATORS.items():
         rng = np.random.default_rng([1, *name.encode()])
-        points = generator(rng, 60 if "scales" in name or "huge" in name else 150, kind, dtype)
+        points = generator(rng, cases(60 if "scales" in name or "huge" in name else 150), kind, dtype)
         truth = TRUTH[kind](points)
         answers = ask(kind, points, normals(kind, points) * 2.0 ** rng.integers(-30, 30, (len(points), 1)))
         assert not answers.boxes[truth].any(), name
@@ -305,16 +306,17 @@ def crossings(rng, n):
 def test_crossings_are_true():
     """Exact contact, contact missed or overdone by an ulp, random features; at scales from 1e-30 to 1e30."""
     rng = np.random.default_rng(9)
-    touching = crossings(rng, 3000)
+    count = cases(3000)
+    touching = crossings(rng, count)
     near = np.where(
-        rng.random((3000, 5, 3)) < 0.2, np.nextafter(touching, rng.choice([-9.0, 9.0], (3000, 5, 3))), touching
+        rng.random((count, 5, 3)) < 0.2, np.nextafter(touching, rng.choice([-9.0, 9.0], (count, 5, 3))), touching
     )
     single = near.astype(np.float32)
-    up = rng.choice([-9.0, 9.0], (3000, 5, 3)).astype(np.float32)
-    single = np.where(rng.random((3000, 5, 3)) < 0.2, np.nextafter(single, up), single).astype(np.float64)
-    free = rng.uniform(-1.0, 1.0, (3000, 5, 3))
-    scaled = touching * 10.0 ** rng.uniform(-30.0, 30.0, (3000, 1, 1))
-    mixed = touching * 10.0 ** rng.uniform(-30.0, 30.0, (3000, 1, 3))
+    up = rng.choice([-9.0, 9.0], (count, 5, 3)).astype(np.float32)
+    single = np.where(rng.random((count, 5, 3)) < 0.2, np.nextafter(single, up), single).astype(np.float64)
+    free = rng.uniform(-1.0, 1.0, (count, 5, 3))
+    scaled = touching * 10.0 ** rng.uniform(-30.0, 30.0, (count, 1, 1))
+    mixed = touching * 10.0 ** rng.uniform(-30.0, 30.0, (count, 1, 3))
     for points in (touching, near, single.astype(np.float64), free, scaled, mixed):
         double, rounded = ask_crossing(points)
         assert_certain_answers(double, crossing_truth(points))

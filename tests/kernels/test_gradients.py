@@ -20,6 +20,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from impacts import impact_kernel
 from outputs import filled_with_nan
+from sample_sizes import cases
 from sheets import crumpled
 
 import warp_bsc as bsc
@@ -121,7 +122,7 @@ def relative_errors(derivatives, expected):
 @functools.cache
 def passing(kind, dtype):
     """Queries that pass through each other, what is found of them, and how well that is defined by the reference."""
-    points = mostly_hits(np.random.default_rng(1), 10_500, kind, dtype)
+    points = mostly_hits(np.random.default_rng(1), cases(10_500), kind, dtype)
     found = impacts(kind, points)
     assert (found.status == HIT).mean() > 0.999
     _, distance, shortest = reference(kind, points.astype(np.float64), found.toi, found.normal)
@@ -136,7 +137,7 @@ def passing(kind, dtype):
 def test_gradients_are_those_of_central_differences(kind, dtype, bound):
     points, found, distance, shortest = passing(kind, dtype)
     away = (distance > 0.02) & (found.status == HIT)
-    assert away.sum() >= 10_000
+    assert away.sum() >= cases(10_000)
     assert not found.grazing[away].any()
     points, found = points[away].astype(np.float64), selected(found, away)
     steps = 1e-3 * distance[away] ** 2 * np.minimum(shortest[away], 1.0)
@@ -182,7 +183,7 @@ def exact_derivative(kind, points, time):
 def test_gradients_of_the_time_are_exact_at_the_root_of_the_checker(kind):
     """Of everything that is not flagged."""
     points, found, *_ = passing(kind, np.float64)
-    points, found = points[:1500], selected(found, np.arange(len(found.toi)) < 1500)
+    points, found = points[: cases(1500)], selected(found, np.arange(len(found.toi)) < cases(1500))
     times = TRUTH[kind](points)[:, 0]
     expected = np.array([exact_derivative(kind, *row) for row in zip(points, times, strict=True)])
     errors = np.linalg.norm(found.derivatives[:, 0] - expected, axis=(1, 2)) / np.linalg.norm(expected, axis=(1, 2))

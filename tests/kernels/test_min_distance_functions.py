@@ -4,6 +4,7 @@ import distances
 import numpy as np
 import pytest
 import warp as wp
+from sample_sizes import cases
 
 from warp_bsc import checker
 from warp_bsc.kernels import ccd_edge_edge, ccd_vertex_edge, ccd_vertex_face, ccd_vertex_vertex
@@ -36,7 +37,7 @@ def answers(kind, points, distance):
 def test_known_distances(kind):
     """To the last bit most answers are unsure, 2^-40 away few are; none is wrong, from 1e-300 to 1e300."""
     rng = np.random.default_rng(1)
-    reached, of_reached = distances.reached(rng, 3000, kind)
+    reached, of_reached = distances.reached(rng, cases(3000), kind)
     for by, most_unsure in (("2^-40", 0.02), ("ulp", 1.0)):
         distance, truth = distances.nudged(rng, of_reached, by)
         status = answers(kind, *distances.scaled(rng, reached, distance))
@@ -47,12 +48,12 @@ def test_known_distances(kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_adversarial_queries(kind):
-    points, distance = distances.adversarial(np.random.default_rng(2), 260, kind)
+    points, distance = distances.adversarial(np.random.default_rng(2), cases(260), kind)
     status, truth = answers(kind, points, distance), getattr(checker, kind)(points, distance)
     assert (status[truth] != 0).all()
     assert (status[~truth] != 1).all()
     assert (status == 2).mean() < 0.12
-    assert min(truth.sum(), (~truth).sum()) > 20
+    assert min(truth.sum(), (~truth).sum()) > cases(20)
 
 
 @pytest.mark.parametrize("kind", KINDS)

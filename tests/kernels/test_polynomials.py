@@ -9,6 +9,7 @@ import pytest
 import warp as wp
 from generators import GENERATORS, integer_lattice, uniform
 from outputs import filled_with_nan
+from sample_sizes import cases
 
 from warp_bsc.kernels import polynomials, signs
 from warp_bsc.kernels.motion import edge_edge_motion, vertex_face_motion
@@ -180,7 +181,7 @@ def remainder(f, g):
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_motion_is_scaled_by_a_power_of_two(kind, dtype):
     rng = np.random.default_rng(1)
-    points = 2.0 ** rng.integers(-20, 21, (200, 1, 1)) * integer_lattice(rng, 200, kind, np.float64)
+    points = 2.0 ** rng.integers(-20, 21, (cases(200), 1, 1)) * integer_lattice(rng, cases(200), kind, np.float64)
     points = points.astype(dtype)
     computed = run(kind, points)
     expected = differences(kind, points)
@@ -204,7 +205,7 @@ def test_motion_to_cull_that_one_power_of_two_cannot_scale_is_zero(kind):
 @pytest.mark.parametrize("kind", KINDS)
 def test_polynomials_have_the_values_of_their_products(kind):
     """Coordinates are small multiples of 3: nothing rounds, not even the thirds, and values are equal."""
-    points = 3.0 * np.random.default_rng(2).integers(-40, 41, (150, 8, 3))
+    points = 3.0 * np.random.default_rng(2).integers(-40, 41, (cases(150), 8, 3))
     computed = run(kind, points)
     ends = differences(kind, points)
     ends = ends * scales(ends)
@@ -333,8 +334,8 @@ def test_inside_tests_are_those_of_the_paper_modulo_coplanarity(kind):
     So at a root of Y the paper's P, its G and our q_i n_i have one sign wherever k0 != 0 (so that the root is not 0)
     and n != 0.
     """
-    lattice = 3.0 * np.random.default_rng(4).integers(-4, 5, (25, 8, 3))
-    points = np.concatenate([lattice, coplanar_at_half(kind, 25)[0]])
+    lattice = 3.0 * np.random.default_rng(4).integers(-4, 5, (cases(25), 8, 3))
+    points = np.concatenate([lattice, coplanar_at_half(kind, cases(25))[0]])
     computed = run(kind, points)
     points = exact(points) * scales(differences(kind, points))
     compared = 0
@@ -360,7 +361,7 @@ def test_inside_tests_are_those_of_the_paper_modulo_coplanarity(kind):
                     if n_i != 0:
                         compared += 1
                         assert np.sign(float(paper)) == np.sign(float(q * n_i))
-    assert compared > 100
+    assert compared > cases(100)
 
 
 # --- Error bounds ---

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import warp as wp
 from generators import mostly_hits, uniform
+from sample_sizes import cases
 
 from warp_bsc import checker
 from warp_bsc.checker.polynomials import differentiate, trim
@@ -220,7 +221,7 @@ def test_double_roots_are_never_counted():
 def test_answers_hold_within_rounding_errors(scale):
     """Perturbs doubles by errors as large as the least bounds allow, to both sides."""
     rng = np.random.default_rng(2)
-    k, q, line = (scale * f for f in polynomials(rng, 2000))
+    k, q, line = (scale * f for f in polynomials(rng, cases(2000)))
     bounds = [unit * (ROUNDOFF * 1e-140 + size(f)) for unit, f in ((SHAPE_BOUND, k), (QUADRATIC_BOUND, q))]
     line_bound = QUADRATIC_BOUND * size(line)
     computed = []
@@ -247,9 +248,9 @@ def corners(rng):
 def test_answers_hold_for_every_polynomial_within_large_bounds():
     """Takes the largest bound at which an answer is certain and asks for the truth in corners of what it allows."""
     rng = np.random.default_rng(3)
-    cases = 700
-    k, q, line = (np.round(1024.0 * f) for f in polynomials(rng, cases))
-    ratio = 2.0 ** rng.integers(-8, 9, (cases, 1))
+    count = cases(700)
+    k, q, line = (np.round(1024.0 * f) for f in polynomials(rng, count))
+    ratio = 2.0 ** rng.integers(-8, 9, (count, 1))
     k_bound = np.maximum(size(k), 1.0)[:, None] * LEVELS
     q_bound, line_bound = (np.maximum(size(f), 1.0)[:, None] * LEVELS * ratio for f in (q, line))
     rows = [np.repeat(f, len(LEVELS), axis=0) for f in (k, q, line)]
@@ -263,9 +264,9 @@ def test_answers_hold_for_every_polynomial_within_large_bounds():
         "line at last": answers.line_signs[:, 1] != 0,
     }
     for name, is_certain in certain.items():
-        largest = is_certain.reshape(cases, -1).argmax(axis=1)
+        largest = is_certain.reshape(count, -1).argmax(axis=1)
         asked = 0
-        for case in range(cases):
+        for case in range(count):
             i = case * len(LEVELS) + largest[case]
             if not is_certain[i]:
                 continue
@@ -277,7 +278,7 @@ def test_answers_hold_for_every_polynomial_within_large_bounds():
                     for f, bound, signs in zip(rows, bounds, (k_signs, q_signs, line_signs), strict=True)
                 ]
                 assert_true(answers, i, *within)
-        assert asked > cases / 5, name
+        assert asked > count / 5, name
         assert LEVELS[largest].max() > 0.05, name
 
 
@@ -376,7 +377,7 @@ def test_cubics_that_are_split_are_classified_at_any_scale():
 def test_classification_alone_decides_nearly_all_random_queries(kind):
     """Without subdivision, the cubics with two extrema, which are split, as often as the others."""
     rng = np.random.default_rng(6)
-    points = np.concatenate([generator(rng, 4000, kind, np.float64) for generator in (uniform, mostly_hits)])
+    points = np.concatenate([generator(rng, cases(4000), kind, np.float64) for generator in (uniform, mostly_hits)])
     n = len(points)
     shape, status = wp.zeros(n, dtype=int), wp.zeros(n, dtype=int)
     inputs = [kind == "edge_edge", wp.array(points, dtype=wp.vec3d)]

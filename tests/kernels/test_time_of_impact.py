@@ -9,6 +9,7 @@ import warp as wp
 from generators import GENERATORS, grazing, mostly_hits, one_ulp_apart, touching, uniform
 from impacts import impact_kernel
 from outputs import filled_with_nan
+from sample_sizes import cases
 
 import warp_bsc as bsc
 from warp_bsc import checker
@@ -170,7 +171,7 @@ def test_no_contact_is_before_the_time_of_impact(kind, dtype):
     tolerance = 2.0**-12
     for name, generator in GENERATORS.items():
         rng = np.random.default_rng([3, *name.encode()])
-        points = generator(rng, 40 if "scales" in name or "huge" in name else 100, kind, dtype)
+        points = generator(rng, cases(40 if "scales" in name or "huge" in name else 100), kind, dtype)
         times = TRUTH[kind](points)
         found = impacts(kind, points, tolerance)
         contact = found.status != FREE
@@ -218,9 +219,9 @@ def test_contacts_of_degenerate_features_are_valid(kind):
         "mixed_scales",
     ):
         rng = np.random.default_rng([4, *name.encode()])
-        points = GENERATORS[name](rng, 400, kind, np.float64)
+        points = GENERATORS[name](rng, cases(400), kind, np.float64)
         found = impacts(kind, points)
-        assert (found.status != FREE).sum() > 20
+        assert (found.status != FREE).sum() > cases(20)
         assert_valid_contact(kind, found, points, found.status != FREE)
 
 
@@ -264,7 +265,7 @@ def test_points_that_are_all_the_same_are_in_contact_from_the_start(kind):
 @functools.cache
 def aimed(kind):
     """Queries that aim at trouble, and the times between which their first contact is, shape (n, 2)."""
-    points = np.concatenate([generator(np.random.default_rng(7), 100, kind, np.float64) for generator in AIMED])
+    points = np.concatenate([generator(np.random.default_rng(7), cases(100), kind, np.float64) for generator in AIMED])
     return points, TRUTH[kind](points)
 
 
@@ -272,7 +273,7 @@ def aimed(kind):
 def random(kind):
     """Queries of which many pass through each other, and the times between which their first contact is."""
     rng = np.random.default_rng(8)
-    points = np.concatenate([generator(rng, 300, kind, np.float64) for generator in (mostly_hits, uniform)])
+    points = np.concatenate([generator(rng, cases(300), kind, np.float64) for generator in (mostly_hits, uniform)])
     return points, TRUTH[kind](points)
 
 

@@ -36,7 +36,9 @@ def check_rest(rollout, dt, steps):
     assert rollout.collisions == 0 and touched > 0.1 * steps
 
 
-@pytest.mark.parametrize(("dt", "steps"), [(1.0 / 60.0, 24), (1.0 / 240.0, 48), (1.0 / 1920.0, 100)])
+@pytest.mark.parametrize(
+    ("dt", "steps"), [(1.0 / 60.0, 24), pytest.param(1.0 / 240.0, 48, marks=pytest.mark.slow), (1.0 / 1920.0, 60)]
+)
 def test_a_drape(dt, steps, device):
     """Cloth comes to rest on a sphere."""
     builder = newton.ModelBuilder()
@@ -67,7 +69,7 @@ def accordion(columns, rows, cell, gap):
     return positions, np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
 
 
-@pytest.mark.parametrize(("dt", "steps"), [(1.0 / 60.0, 12), (1.0 / 240.0, 40)])
+@pytest.mark.parametrize(("dt", "steps"), [(1.0 / 60.0, 12), pytest.param(1.0 / 240.0, 40, marks=pytest.mark.slow)])
 def test_a_fold(dt, steps, device):
     """Four layers of one strip fall onto each other and the ground, and rest."""
     positions, faces = accordion(32, 8, 0.01, 0.01)

@@ -15,6 +15,8 @@ KINDS = {
     "monitor": lambda model: bsc.CollisionMonitor(SOLVERS["xpbd"](model)),
 }
 
+LONG = [pytest.mark.slow]
+
 
 @pytest.fixture
 def model(device):
@@ -35,8 +37,13 @@ def content(*states):
     ]
 
 
-@pytest.mark.parametrize("in_place", [False, True])
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    ("kind", "in_place"),
+    [
+        *((kind, True) for kind in KINDS),
+        *(pytest.param(kind, False, marks=LONG * (kind != "ccd")) for kind in KINDS),
+    ],
+)
 def test_a_step_without_memory_leaves_its_start_and_the_report(device, model, kind, in_place):
     """Also where the inner solver writes to its start, as XPBD does, and where a substep has been taken."""
 

@@ -29,7 +29,7 @@ from warp_bsc.scene_replay import checking, worker, workers
 
 FILES = {"--json": "hits.json", "--csv": "hits.csv", "--overlay": "overlay.usdc", "--report": "page.html"}
 FILES["--npz"] = "hits.npz"
-FRAMES, SIDE = 24, 5
+FRAMES, SIDE = 24, 3
 
 
 def add_sheet(stage, name, lag, broken=None):
@@ -139,6 +139,7 @@ def test_two_workers_write_the_same_files(troubled, alone, tmp_path, capsys):
     assert len(re.findall(r"^  \S+:\d+ on cpu: \d+ intervals?, \d+\.\d+ s$", printed, re.MULTILINE)) == 2
 
 
+@pytest.mark.slow
 def test_a_process_for_each_named_device_writes_the_same_files(waves, tmp_path, capsys):
     """Also for one that is named twice, which is how a CPU tries several."""
     wanted = run(waves, tmp_path / "1")
@@ -158,6 +159,7 @@ def test_devices_that_are_not_there_or_too_many(waves, capsys):
         assert said in capsys.readouterr().err
     with pytest.raises(ValueError, match=r"^workers must be an integer of at least 2"):
         bsc.replay(bsc.Scene(waves), device="cpu,cpu", workers=1)
+    assert [workers.checked_workers(None, names) for names in (None, "cpu", "cpu,cpu")] == [1, 1, 2]
     with pytest.raises(ValueError, match="cuda:99: there is no such device here, only cpu"):
         list(bsc.replay(bsc.Scene(waves), device="cpu,cuda:99"))
 
@@ -194,7 +196,13 @@ def test_chunks_are_of_equal_length(waves, monkeypatch, intervals):
     assert len(chunks) == {7: 4, 50: 12}.get(intervals, len(chunks))
 
 
-@pytest.mark.parametrize("options", [(), ("--ignore-initial", "--ignore", "/World/A", "*", "--clearance", "0.02")])
+@pytest.mark.parametrize(
+    "options",
+    [
+        pytest.param((), marks=pytest.mark.slow),
+        ("--ignore-initial", "--ignore", "/World/A", "*", "--clearance", "0.02"),
+    ],
+)
 def test_any_number_of_intervals_at_once(troubled, tmp_path, monkeypatch, options):
     """Each by itself, some, or all that have one segment: the files are the same, with all counts."""
     found = []
@@ -233,17 +241,18 @@ def test_results_of_workers_in_python(waves):
         assert one.work.worker == "" and re.fullmatch(r".+:\d+", other.work.worker)
 
 
-def test_a_worker_that_is_killed(waves):
+@pytest.mark.parametrize("kills", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_a_worker_that_is_killed(waves, kills):
     """What it was checking is checked by another one: nothing is lost, nothing comes twice."""
     alone = [result.summary.mesh_pairs for result in bsc.replay(bsc.Scene(waves), device="cpu")]
     found, killed = [], set()
     for result in bsc.replay(bsc.Scene(waves), device="cpu", workers=2):
         found.append((result.summary.index, result.summary.mesh_pairs))
         pid = int(result.work.worker.rpartition(":")[2])
-        if len(killed) < 2 and pid not in killed:
+        if len(killed) < kills and pid not in killed:
             killed.add(pid)
             os.kill(pid, signal.SIGKILL)
-    assert len(killed) == 2
+    assert len(killed) == kills
     assert found == list(enumerate(alone))
 
 

@@ -91,7 +91,7 @@ def test_a_crowd_of_instances_is_the_same_crowd_without(tmp_path, own_animation)
     for instanceable in (False, True):
         stage = new_stage(tmp_path / f"crowd_{instanceable}.usda")
         lots = random.Random(1)
-        for number in range(20):
+        for number in range(12):
             prim = stage.DefinePrim(f"/World/Person{number}")
             prim.GetReferences().AddReference("./character.usda")
             prim.SetInstanceable(instanceable)
@@ -101,7 +101,7 @@ def test_a_crowd_of_instances_is_the_same_crowd_without(tmp_path, own_animation)
             if not own_animation:
                 bind_animation(stage, f"/World/Animation{number}", prim, lots.uniform(30, 70))
         found.append(find(stage))
-    assert len(found[0]["mesh_pairs"]) > 10
+    assert len(found[0]["mesh_pairs"]) > 5
     for key in ("start", "contacts"):
         assert [interval[key] for interval in found[0]["intervals"]] == [i[key] for i in found[1]["intervals"]]
 

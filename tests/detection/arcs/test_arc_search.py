@@ -75,7 +75,7 @@ def pairs_of(mesh, kind):
     return pairs[apart], corners[apart]
 
 
-@pytest.mark.parametrize("seed", [1, 3, 4, 8])
+@pytest.mark.parametrize("seed", [1, 4, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (3, 8))])
 def test_all_that_collides_is_found_and_nothing_far(seed, device):
     """Against 200 samples of every pair, with a bound of what lies between them."""
     dtype = np.float32 if seed % 2 else np.float64
@@ -326,7 +326,7 @@ def test_a_body_collides_with_what_is_tied_to_it(device, broad_phase):
     np.testing.assert_allclose(found.vertex_face_toi, 0.5, atol=0.02)
 
 
-@pytest.mark.parametrize("angle", [0.5, 2.0])
+@pytest.mark.parametrize("angle", [0.5, pytest.param(2.0, marks=pytest.mark.slow)])
 def test_pairs_within_a_body_that_deforms_are_looked_at(angle, device):
     """Along the axis deformations turn into themselves: pairs collide as on straight paths in the frame of the body."""
     rng = np.random.default_rng(int(angle))

@@ -6,6 +6,7 @@ from collections import Counter
 import numpy as np
 import pytest
 from intersection_cases import TOUCHING_IN_LINE, ULP, cases_by_definition, definite_cases, parts_of, soup, true_pairs
+from sample_sizes import cases
 
 import warp_bsc as bsc
 
@@ -103,7 +104,7 @@ def test_triangles_that_share_a_vertex_meet_elsewhere_if_and_only_if_a_pair_is_f
     rng = np.random.default_rng(3)
     faces = np.array([[0, 1, 2], [0, 3, 4]])
     answers = []
-    for _ in range(600):
+    for _ in range(cases(600)):
         x = np.concatenate([np.zeros((1, 3)), rng.integers(-2, 3, (4, 3))])
         if any(not np.cross(x[a], x[b]).any() for a, b in ((1, 2), (3, 4))):
             continue
@@ -115,7 +116,7 @@ def test_triangles_that_share_a_vertex_meet_elsewhere_if_and_only_if_a_pair_is_f
         meets = bsc.checker.edge_face_crossings(near[edges[rows]], corners[columns]).any()
         assert (len(found(x, faces)) > 0) == meets
         answers.append(meets)
-    assert 50 < np.sum(answers) < len(answers) - 50
+    assert cases(50) < np.sum(answers) < len(answers) - cases(50)
 
 
 def test_parts():

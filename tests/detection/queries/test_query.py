@@ -6,6 +6,7 @@ import warp as wp
 from benchmark_data import load_cloth_funnel_queries, load_queries
 from certify_contacts import KINDS, judge
 from generators import GENERATORS
+from sample_sizes import cases
 
 import warp_bsc as bsc
 from warp_bsc import checker
@@ -92,7 +93,7 @@ def test_conservative_and_float_err_no_more_than_promised():
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", GENERATORS)
 def test_certified_answers_never_contradict_the_truth(name, kind, dtype):
-    count = 20 if name == "subnormal_and_huge" else 250
+    count = cases(20 if name == "subnormal_and_huge" else 250)
     verdict = judge(kind, GENERATORS[name](np.random.default_rng([7, *name.encode()]), count, kind, dtype))
     assert (verdict.wrong, verdict.missed, verdict.exact_wrong, verdict.late, verdict.early) == (0, 0, 0, 0, 0)
     if name in ("uniform", "mostly_hits"):

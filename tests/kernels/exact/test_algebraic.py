@@ -5,6 +5,7 @@ from math import comb
 import numpy as np
 import warp as wp
 from outputs import filled_with_nan
+from sample_sizes import cases
 
 from warp_bsc.checker.polynomials import differentiate, trim
 from warp_bsc.checker.roots import doubles_around, inner_part, isolated_roots, sign_at_root
@@ -117,7 +118,7 @@ def with_multiplicity(f, intervals):
 
 def test_roots_are_counted_and_signs_are_those_at_the_roots():
     rng = np.random.default_rng(0)
-    f, q = polynomials(rng, 4000)
+    f, q = polynomials(rng, 1000 + cases(3000))
     cubic_roots, quadratic_roots, signs, cubic_signs, times = ask(f, q)
     seen = set()
     for i in range(len(f)):

@@ -11,6 +11,7 @@ from generators import GENERATORS, _weights, _with_gap
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from sample_sizes import cases
 from test_wide_integers import to_integers
 
 import warp_bsc as bsc
@@ -42,7 +43,7 @@ def assert_true(kind, points, limbs, *, least=1.0):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", GENERATORS)
 def test_answers_are_true_in_every_width(name, kind, dtype):
-    count = 8 if name == "subnormal_and_huge" else 40
+    count = cases(8 if name == "subnormal_and_huge" else 40)
     points = GENERATORS[name](np.random.default_rng([13, *name.encode()]), count, kind, dtype)
     for limbs in BITS:
         assert_true(kind, points, limbs, least=1.0 if dtype == np.float32 and limbs == 8 else 0.0)
@@ -70,15 +71,15 @@ def turning_planes(rng, n, kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_motion_in_a_turning_plane(kind):
-    points = turning_planes(np.random.default_rng(3), 600, kind)
+    points = turning_planes(np.random.default_rng(3), cases(600), kind)
     truth = getattr(checker, kind)(points)
-    assert 100 < truth.sum() < 500
+    assert cases(100) < truth.sum() < cases(500)
     for limbs in BITS:
         assert_true(kind, points, limbs)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@settings(max_examples=25)
+@settings(max_examples=cases(25))
 @given(
     coordinates=arrays(np.int64, (40, 8, 3), elements=st.integers(-3, 3)),
     axes=st.permutations(range(3)),
@@ -321,8 +322,8 @@ def widest_queries(rng, n, kind, limbs):
 def test_no_number_exceeds_its_bound(kind, limbs):
     rng = np.random.default_rng(limbs)
     names = [name for name in GENERATORS if name != "subnormal_and_huge"]
-    points = [GENERATORS[name](rng, 150, kind, np.float64) for name in names]
-    points = np.concatenate([*points, widest_queries(rng, 4000, kind, limbs)])
+    points = [GENERATORS[name](rng, cases(150), kind, np.float64) for name in names]
+    points = np.concatenate([*points, widest_queries(rng, cases(4000), kind, limbs)])
     _, bits = decide_exactly(kind, points, limbs)
     points, bits = points[bits <= BITS[limbs]], bits[bits <= BITS[limbs]]
     assert bits.max() == BITS[limbs]

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import warp as wp
 from compilation import QUICK
+from sample_sizes import cases
 
 from warp_bsc import checker
 from warp_bsc.kernels import FREE, HIT, UNSURE
@@ -70,7 +71,7 @@ def assert_true(kind, points, distance, *, decided=0.0, limbs=tuple(BITS)):
 @pytest.mark.parametrize("kind", distances.KINDS)
 def test_no_answer_is_untrue(kind):
     rng = np.random.default_rng([2, *kind.encode()])
-    points, distance = distances.reached(rng, 150, kind)
+    points, distance = distances.reached(rng, 50 + cases(100), kind)
     distance, truth = distances.nudged(rng, distance)
     points, distance = distances.scaled(rng, points, distance, -40, 40)
     np.testing.assert_array_equal(assert_true(kind, points, distance, decided=0.4), truth)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import warp as wp
+from sample_sizes import cases
 
 from warp_bsc.kernels.exact import filters
 from warp_bsc.kernels.exact.wide_integers import integer
@@ -85,7 +86,7 @@ def random_rows(rng, n):
 
 
 def test_signs_are_right_where_they_are_certain():
-    rows = [row for row in random_rows(np.random.default_rng(1), 4000) if row[1][2] != 0]
+    rows = [row for row in random_rows(np.random.default_rng(1), cases(4000)) if row[1][2] != 0]
     n = len(rows)
     roots = np.resize([1, 2], n).astype(np.int32)
     p, q = (wp.array(to_limbs([row[part] for row in rows]), dtype=number, device="cpu") for part in (0, 1))

@@ -7,6 +7,7 @@ import pytest
 import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sample_sizes import cases
 
 from warp_bsc import checker
 from warp_bsc.kernels.exact.rest import meet_at_rest
@@ -48,19 +49,19 @@ def test_every_small_lattice(device):
 @pytest.mark.parametrize("size", [1e-45, 1e-30, 1e-17, 1.0, 1e18, 1e37])
 def test_almost_degenerate(size, device):
     """A coordinate is off by one bit, or differs from the others by any power of two."""
-    rng = np.random.default_rng(4)
-    points = np.float32(size) * rng.integers(-2, 3, (3000, 4, 3)).astype(np.float32)
-    flat = rng.random(3000) < 0.7
+    rng, count = np.random.default_rng(4), cases(3000)
+    points = np.float32(size) * rng.integers(-2, 3, (count, 4, 3)).astype(np.float32)
+    flat = rng.random(count) < 0.7
     points[flat, :, rng.integers(0, 3)] = 0.0
-    rows, corner, axis = np.arange(3000), rng.integers(0, 4, 3000), rng.integers(0, 3, 3000)
+    rows, corner, axis = np.arange(count), rng.integers(0, 4, count), rng.integers(0, 3, count)
     moved = points[rows, corner, axis]
-    moved = np.where(rng.random(3000) < 0.5, np.nextafter(moved, np.float32(np.inf)), moved)
-    tiny = np.float32(2.0) ** rng.integers(-149, -20, 3000)
-    points[rows, corner, axis] = np.where(rng.random(3000) < 0.3, tiny, moved)
-    assert check(points, device) > 20
+    moved = np.where(rng.random(count) < 0.5, np.nextafter(moved, np.float32(np.inf)), moved)
+    tiny = np.float32(2.0) ** rng.integers(-149, -20, count)
+    points[rows, corner, axis] = np.where(rng.random(count) < 0.3, tiny, moved)
+    assert check(points, device) > cases(20)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=cases(50), deadline=None)
 @given(st.lists(st.floats(width=32, allow_nan=False, allow_infinity=False), min_size=12, max_size=12))
 def test_any_numbers(values):
     check(np.reshape(values, (1, 4, 3)), "cpu")

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 from generators import GENERATORS
+from sample_sizes import cases
 from simd_packets import in_normal_range
 
 from warp_bsc.bench.measure.methods import Queries, QuerySet
@@ -67,7 +68,7 @@ def classify_both_ways(kind, points, roundoff):
 @pytest.mark.parametrize("kind", KINDS)
 def test_statuses_are_those_of_one_query(kind, dtype):
     rng = np.random.default_rng(8)
-    number = 1003  # no multiple of eight
+    number = cases(1003)  # no multiple of eight
     for roundoff in (0.0, float(ROUNDOFF)):
         found = {status: 0 for status in (int(FREE), int(HIT), int(UNSURE), int(OPEN))}
         for name, generator in GENERATORS.items():
@@ -78,4 +79,4 @@ def test_statuses_are_those_of_one_query(kind, dtype):
             assert np.array_equal(alone[decided], together[decided]), (name, roundoff)
             for status in found:
                 found[status] += int((together == status).sum())
-        assert all(found[status] > 100 for status in (FREE, HIT, OPEN) + (UNSURE,) * (roundoff > 0.0)), found
+        assert all(found[status] > cases(100) for status in (FREE, HIT, OPEN) + (UNSURE,) * (roundoff > 0.0)), found

@@ -5,6 +5,7 @@ import pytest
 import warp as wp
 from generators import GENERATORS
 from outputs import filled_with_nan
+from sample_sizes import cases
 from simd_packets import in_normal_range
 
 from warp_bsc.bench.measure.methods import Queries, QuerySet
@@ -131,7 +132,7 @@ def find_both_ways(kind, points, roundoff, tolerance):
 def test_impacts_are_those_of_one_query(kind, dtype):
     rng = np.random.default_rng(9)
     for roundoff, tolerance in ((float(ROUNDOFF), 2.0**-20), (0.0, 2.0**-20), (float(ROUNDOFF), 2.0**-37)):
-        number = 403 if tolerance > 2.0**-30 else 103
+        number = cases(403 if tolerance > 2.0**-30 else 103)
         seen = dict.fromkeys((int(FREE), int(HIT), int(UNSURE)), 0)
         for name, generator in GENERATORS.items():
             points = generator(rng, number, kind, dtype)
@@ -147,4 +148,4 @@ def test_impacts_are_those_of_one_query(kind, dtype):
             assert not untimed[1].any() and all(np.isnan(array).all() for array in untimed[2:])  # not written
             for status in seen:
                 seen[status] += int((alone[0] == status).sum())
-        assert all(seen[status] > 20 for status in seen if roundoff > 0.0 or status == HIT), seen
+        assert all(seen[status] > cases(20) for status in seen if roundoff > 0.0 or status == HIT), seen

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import warp as wp
 from newton_scenes import DT, SOLVERS, STIFF, Changed, Rollout, add_crossing_sheets, add_patch, crossing_sheets
+from sample_sizes import cases
 from stage_stress import SCENES, Stress
 
 import warp_bsc as bsc
@@ -261,6 +262,6 @@ def test_steps_from_anywhere(name, device):
     scene = SCENES[name]
     # long paths meet everything, which takes long
     worlds, steps = (8, 8) if scene.path <= 0.1 else (3, 3 if scene.lattice else 5) if scene.path < 5.0 else (1, 3)
-    stress = Stress(scene, np.random.default_rng(7), worlds=worlds, device=device)
+    stress = Stress(scene, np.random.default_rng(7), worlds=cases(worlds), device=device)
     for _ in range(steps):
         assert stress.step()

@@ -17,6 +17,9 @@ from newton_versions import needs_attachments
 import warp_bsc as bsc
 from warp_bsc.response.drive import coupling
 
+STEPS = 28
+"""Of a ball that flies at a sheet, as far as it takes to be stopped or to pass."""
+
 
 def ball_builder(mass):
     """A ball above a pinned sheet."""
@@ -90,12 +93,12 @@ def fall(model, solver, steps):
     [
         ("vbd", 0.2, "lagged", 1),
         pytest.param("vbd", 0.2, "staggered", 1, marks=pytest.mark.slow),
-        ("xpbd", 0.02, "lagged", 2),
+        pytest.param("xpbd", 0.02, "lagged", 2, marks=pytest.mark.slow),
     ],
 )
 def test_a_proxy_flies_as_a_body_of_the_inner_solver_does(inner, mass, mode, iterations, device):
     """The impulses of the response on the proxy reach the solver that owns the body, with ``lagged`` a step later."""
-    model, steps = ball_over_sheet(device, mass), 40
+    model, steps = ball_over_sheet(device, mass), STEPS
     alone = bsc.SolverCCD(SOLVERS[inner](model))
     expected, _ = fall(model, alone, steps)
     solver, stage = with_proxy(model, inner, iterations, mode=mode)
@@ -119,9 +122,9 @@ def test_a_step_is_certified_in_the_state_of_the_program(mode, iterations, mass,
     solver, stage = with_proxy(model, iterations=iterations, mode=mode)
     rollout, report, passing = Rollout(model, solver), stage.report, []
     unseen = with_proxy(model, iterations=iterations, mode=mode)[0]
-    expected, _ = fall(model, unseen, 40)  # a look changes nothing
+    expected, _ = fall(model, unseen, STEPS)  # a look changes nothing
     with pytest.warns(UserWarning, match=r"in the state of the program a step is not certified.* body 0 \('body_0'\)"):
-        for i in range(40):
+        for i in range(STEPS):
             crosses = rollout.find_crossings(rollout.vertices(rollout.states[0]))
             rollout.step()
             passing.append(bool(crosses or rollout.new_collisions))
@@ -132,22 +135,22 @@ def test_a_step_is_certified_in_the_state_of_the_program(mode, iterations, mass,
                 assert report.certified != passing[-1] and report.totals.revoked_steps == sum(passing)
                 assert report.uncertified_bodies.tolist() == [0] * passing[-1]
                 assert (report.crossings > 0) == bool(crosses) and report.totals.unseen_steps == 0
-    assert report.totals.uncertified_steps == sum(passing) and 0 < sum(passing) < 40
+    assert report.totals.uncertified_steps == sum(passing) and 0 < sum(passing) < STEPS
     assert report.penetrated and report.totals.penetrated_steps == sum(passing)
     np.testing.assert_array_equal(rollout.states[0].body_q.numpy()[0], expected[-1])
 
 
-@pytest.mark.parametrize("mode", ["lagged", "staggered"])
+@pytest.mark.parametrize("mode", [pytest.param("lagged", marks=pytest.mark.slow), "staggered"])
 def test_a_stage_around_the_coupled_solver_keeps_the_state_of_the_program_free(mode, device, recwarn):
     """Where the stage in the entry alone does not; the ball still feels the sheet."""
     model = ball_over_sheet(device)
     solver, entry = with_proxy(model, mode=mode)
     rollout = Rollout(model, bsc.SolverCCD(solver))
-    for _ in range(40):
+    for _ in range(STEPS):
         rollout.step()
         assert rollout.solver.report.certified and not rollout.find_crossings(rollout.vertices(rollout.states[0]))
-    assert rollout.collisions == 0 and entry.report.totals.steps == 40
-    assert rollout.states[0].body_q.numpy()[0, 2] > 0.055 - 40 * DT + 0.02
+    assert rollout.collisions == 0 and entry.report.totals.steps == STEPS
+    assert rollout.states[0].body_q.numpy()[0, 2] > 0.055 - STEPS * DT + 0.02
     assert not [warning for warning in recwarn if "in the state of the program" in str(warning.message)]
 
 
@@ -155,7 +158,7 @@ def test_a_monitor_around_the_coupled_solver_counts_what_passes(device):
     model = ball_over_sheet(device)
     solver, _entry = with_proxy(model, mode="staggered")
     rollout, uncertified = Rollout(model, bsc.CollisionMonitor(solver)), 0
-    for _ in range(40):
+    for _ in range(STEPS):
         rollout.step()
         assert rollout.solver.report.predicted_contacts == len(rollout.new_collisions)
         uncertified += bool(rollout.new_collisions)
@@ -194,7 +197,7 @@ def test_worlds_and_resets_of_a_program_are_told_apart(device):
         states.reverse()
         return report.worlds.certified.numpy().tolist()
 
-    for _ in range(40):
+    for _ in range(STEPS):
         assert step() == [False, False]
         solver.sync_entry_states(states[0])
         if not report.certified:
@@ -349,7 +352,7 @@ def test_a_captured_graph_steps_as_the_solver_does(device):
     np.testing.assert_array_equal(*ends)
 
 
-@pytest.mark.parametrize("iterations", [1, 2])
+@pytest.mark.parametrize("iterations", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_what_two_entries_pass_of_each_other_is_met_in_the_next_step(iterations, device):
     """Each entry sees the other at its start: two patches swap sides in a step, and are pushed back in the next."""
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))

@@ -6,6 +6,7 @@ import pytest
 import warp as wp
 from newton.solvers import SolverStyle3D
 from newton_scenes import Rollout
+from sample_sizes import cases
 from style3d_scenes import add_sheet, drape
 
 import warp_bsc as bsc
@@ -36,9 +37,9 @@ def roll(model, steps, **options):
 @pytest.mark.parametrize("sheets", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_drape_stretches_hardly(sheets, device, monkeypatch):
     model = drape(device, sheets=sheets)
-    rollout, stretch = roll(model, 60)
+    rollout, stretch = roll(model, 36)
     monkeypatch.setattr(SpringSteps, "take", InnerSteps.take)  # which does not see them
-    _, without = roll(model, 60)
+    _, without = roll(model, 36)
     assert stretch < 0.12 and without > 2.0 * stretch
     assert rollout.positions[:, 2].max() > 0.15  # it lies on the sphere
 
@@ -49,7 +50,7 @@ def test_equal_runs_are_equal_bit_for_bit(device):
         pytest.skip("on a GPU Style3D itself adds forces in any order")
     model = drape(device, sheets=2, cells=16)
     ends = []
-    for _ in range(4):
+    for _ in range(1 + cases(3)):
         solver, states = bsc.SolverCCD(SolverStyle3D(model)), [model.state(), model.state()]
         for _ in range(8):
             solver.step(*states, model.control(), None, 1.0 / RATE)

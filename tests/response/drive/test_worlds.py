@@ -137,7 +137,7 @@ def test_each_world_is_stepped_as_if_it_were_alone(inner, substeps, device):
     assert hits > 50
 
 
-@pytest.mark.parametrize("inner, substeps", [("vbd", 1), ("xpbd", 2)])
+@pytest.mark.parametrize("inner, substeps", [pytest.param("vbd", 1, marks=pytest.mark.slow), ("xpbd", 2)])
 def test_a_world_that_takes_no_part_changes_no_bit_and_goes_on_as_if_nothing_had_been(inner, substeps, device):
     model = finalize(range(3), device)
     free = Worlds(model, new_stage(model, inner, substeps=substeps))

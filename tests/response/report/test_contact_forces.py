@@ -46,8 +46,8 @@ def step_forces(model, solver, dt, steps):
         pytest.param("vbd", 2, 120, marks=pytest.mark.slow),
         pytest.param("xpbd", 1, 240, marks=pytest.mark.slow),
         ("xpbd", 2, 240),
-        ("semi_implicit", 1, 960),
-        ("semi_implicit", 2, 480),
+        pytest.param("semi_implicit", 1, 960, marks=pytest.mark.slow),
+        pytest.param("semi_implicit", 2, 480, marks=pytest.mark.slow),
     ],
 )
 def test_a_scale_under_a_cloth_shows_its_weight(inner, substeps, rate, device):

@@ -231,7 +231,7 @@ def test_coupling_stops_a_ball_earlier(device):
         model = ball_and_sheet(device, fixed=True, n=6)
         rollout = Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model), substeps=substeps))
         heights = []
-        for _ in range(24):
+        for _ in range(16):
             rollout.step()
             heights.append(rollout.states[0].body_q.numpy()[0, 2])
         assert rollout.collisions == 0 and rollout.solver.report.totals.uncertified_steps == 0

@@ -9,6 +9,7 @@ import warp as wp
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from newton_scenes import DT, SOLVERS, STIFF, Changed, Rollout, add_patch, add_plates, bullet, place_plates
+from sample_sizes import cases
 
 import warp_bsc as bsc
 from warp_bsc.response.contacts.first_contact import packed_contact
@@ -273,7 +274,7 @@ def test_no_room(device):
         assert end.tolist() == list(START) and cut
 
 
-@settings(max_examples=40)
+@settings(max_examples=cases(40))
 @given(seed=st.integers(0, 2**32 - 1), room=st.sampled_from([1e-9, 1e-10, 1e-11, 1e-12]))
 def test_elements_nearer_than_coordinates_are_precise(seed, room, device):
     """A vertex slides along the plane all the same: its end is rounded upwards."""
@@ -290,7 +291,7 @@ def test_elements_nearer_than_coordinates_are_precise(seed, room, device):
 _NUMBER = st.integers(-8, 8).map(lambda i: i / 8.0)  # of few bits, so that planes are symmetric and equally far
 
 
-@settings(max_examples=40)
+@settings(max_examples=cases(40))
 @given(
     normals=st.lists(st.tuples(_NUMBER, _NUMBER, st.integers(1, 8).map(lambda i: i / 8.0)), min_size=2, max_size=4),
     x1=st.tuples(_NUMBER, _NUMBER, st.integers(-8, 4).map(lambda i: i / 8.0)),
@@ -319,7 +320,7 @@ def distance_above(planes, x, margins):
     return min(np.linalg.norm(move) for move in moves if (normals @ move >= missing - 1e-9).all())
 
 
-@settings(max_examples=60)
+@settings(max_examples=cases(60))
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(3, 9), spread=st.sampled_from([0.01, 0.3, 1.0, 3.0]))
 def test_the_end_is_the_nearest_position_above_all_planes(seed, count, spread, device):
     """With any number of planes around the start, many of them nearly parallel; the path is never cut."""
@@ -336,7 +337,7 @@ def test_the_end_is_the_nearest_position_above_all_planes(seed, count, spread, d
     assert moved <= distance_above(planes, x1.astype(float), 1.0) + 1e-6
 
 
-@settings(max_examples=40)
+@settings(max_examples=cases(40))
 @given(seed=st.integers(0, 2**32 - 1), tilt=st.sampled_from([1e-6, 1e-4, 1e-2]))
 @example(seed=0, tilt=1e-4)
 def test_planes_take_a_vertex_no_farther_than_its_path(seed, tilt, device):

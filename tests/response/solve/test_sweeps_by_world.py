@@ -47,7 +47,9 @@ def run(speeds, device, options):
 
 
 @pytest.mark.filterwarnings("ignore:a step")
-@pytest.mark.parametrize("options", [{}, {"min_distance": 0.004}, {"substeps": 3}], ids=str)
+@pytest.mark.parametrize(
+    "options", [pytest.param({}, marks=pytest.mark.slow), {"min_distance": 0.004}, {"substeps": 3}], ids=str
+)
 def test_worlds_swept_apart_are_solved_as_by_a_launch_for_each_sweep_and_alone(options, monkeypatch, device):
     together, hits = run(SPEEDS, device, options)
     assert hits[0] == 0 and (hits[1:] > 0).all()

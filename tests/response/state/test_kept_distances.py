@@ -210,7 +210,7 @@ def test_plates_bodies_and_coupled_steps(options, device):
     assert hits > 20 and rollout.approaches == 0
 
 
-@pytest.mark.parametrize(("gap", "lifts"), [(2.5, True), (1.5, False)])
+@pytest.mark.parametrize(("gap", "lifts"), [(2.5, True), pytest.param(1.5, False, marks=pytest.mark.slow)])
 def test_kinematic_fingers_lift_cloth_by_the_gap_of_the_guide(gap, lifts, device):
     """With a layer in between, a gap of 2.5 distances holds it; below 2 distances there is no space for it."""
     distance, half, steps = 0.004, 0.01, 10

@@ -190,16 +190,16 @@ def _define_material(stage, root, part):
 
 def _define_variants(root, name, hidden):
     """Defines the variants of a prim, each of which hides some prims below it, and selects the first."""
-    from pxr import UsdGeom  # noqa: PLC0415 (slow)
+    from pxr import Sdf, UsdGeom  # noqa: PLC0415 (slow)
 
-    variants = root.GetVariantSets().AddVariantSet(name)
-    for variant, prims in hidden.items():
-        variants.AddVariant(variant)
-        variants.SetVariantSelection(variant)
-        with variants.GetVariantEditContext():
-            for prim in prims:
-                path = root.GetPath().AppendPath(prim)
-                UsdGeom.Imageable(root.GetStage().OverridePrim(path)).CreateVisibilityAttr(UsdGeom.Tokens.invisible)
+    variants, layer = root.GetVariantSets().AddVariantSet(name), root.GetStage().GetRootLayer()
+    with Sdf.ChangeBlock():  # one composition of the stage, not one for each prim of each variant
+        for variant, prims in hidden.items():
+            inside = root.GetPath().AppendVariantSelection(name, variant)
+            Sdf.CreatePrimInLayer(layer, inside)
+            for path in (inside.AppendPath(prim).AppendProperty("visibility") for prim in prims):
+                Sdf.JustCreatePrimAttributeInLayer(layer, path, Sdf.ValueTypeNames.Token)
+                layer.GetAttributeAtPath(path).default = UsdGeom.Tokens.invisible
     variants.SetVariantSelection(next(iter(hidden)))
 
 
