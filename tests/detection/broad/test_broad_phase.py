@@ -167,7 +167,7 @@ def sorted_face_pairs(mesh, x0, x1, keep_separated=False):
     return in_order(np.stack([a, b], axis=1), len(mesh.faces))
 
 
-@pytest.mark.parametrize("worlds", [pytest.param(1, marks=pytest.mark.slow), 3])
+@pytest.mark.parametrize("worlds", [1, 3])
 def test_many_bundles(worlds):
     """More bundles than a warp tests at once, of one sheet that moves through itself."""
     n = 132 if worlds == 1 else 76

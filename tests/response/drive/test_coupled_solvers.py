@@ -93,7 +93,7 @@ def fall(model, solver, steps):
     [
         ("vbd", 0.2, "lagged", 1),
         pytest.param("vbd", 0.2, "staggered", 1, marks=pytest.mark.slow),
-        pytest.param("xpbd", 0.02, "lagged", 2, marks=pytest.mark.slow),
+        ("xpbd", 0.02, "lagged", 2),
     ],
 )
 def test_a_proxy_flies_as_a_body_of_the_inner_solver_does(inner, mass, mode, iterations, device):
