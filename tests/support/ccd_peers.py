@@ -125,7 +125,7 @@ def main():
     parser = options_of(__doc__)
     parser.add_argument("--count", type=int, default=100, help="queries of a generator and kind (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--limit", type=float, default=1.0, help="processor time of a query [s] (default: %(default)s)")
+    parser.add_argument("--limit", type=float, default=0.5, help="processor time of a query [s] (default: %(default)s)")
     arguments = parser.parse_args()
     wp.config.log_level = wp.LOG_WARNING
     hand_made = [("hand-made", *rest) for _, *rest in load_queries()]
