@@ -161,7 +161,7 @@ def certify(*runs: Found) -> Rows:
     return markdown("answers by", columns, rows)
 
 
-_DETECTORS = {
+DETECTORS = {
     "exact": "`exact`",
     "conservative": "`conservative`, the default",
     "float": "`float`",
@@ -188,7 +188,7 @@ def detectors(found: Found) -> Rows:
         tuple(head),
         *(
             (title, *(total(rows, key, name) for rows in parts.values() for key in ("missed", "false", "late")))
-            for name, title in _DETECTORS.items()
+            for name, title in DETECTORS.items()
         ),
     ]
 
@@ -196,8 +196,8 @@ def detectors(found: Found) -> Rows:
 def detectors_missed(found: Found) -> Rows:
     """Misses by the generator of adversarial queries, of the detectors that miss any."""
     runs = pivot((row for row in found["rows"] if row["queries"] != "hand-made"), "queries", "detector")
-    names = [name for name in _DETECTORS if any(row[name]["missed"] for row in runs.values())]
-    columns = [Column(_DETECTORS[name], lambda row, name=name: row[name]["missed"]) for name in names]
+    names = [name for name in DETECTORS if any(row[name]["missed"] for row in runs.values())]
+    columns = [Column(DETECTORS[name], lambda row, name=name: row[name]["missed"]) for name in names]
     rows = [
         (f"`{queries}`, {row['exact']['colliding']:,} collide", row)
         for queries, row in runs.items()

@@ -164,7 +164,7 @@ def test_detectors():
         counts = {"colliding": 1000, "free": 300, "missed": missed, "false": false, "late": late}
         return {"queries": queries, "detector": detector} | counts
 
-    others = [row(name, detector, 0, 1, 2) for detector in rows_of._DETECTORS for name in ("hand-made", "a", "b")]
+    others = [row(name, detector, 0, 1, 2) for detector in rows_of.DETECTORS for name in ("hand-made", "a", "b")]
     rows = [other for other in others if other["detector"] not in ("float", "additive")]
     rows += [row(name, "float", 5, 6, 0) for name in ("hand-made", "a", "b")]
     rows += [row("hand-made", "additive", 0, 4, 7), row("a", "additive", 0, 0, 1), row("b", "additive", 8, 0, 1)]
