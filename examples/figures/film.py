@@ -34,6 +34,7 @@ class Film(NamedTuple):
         duration: Time that a frame is shown [ms].
         pause: Time that the last frame of each part is shown [ms].
         part: Number of frames of a part; by default the film is one part.
+        quality: Quality of the pictures, 0 to 100.
     """
 
     frames: int
@@ -41,6 +42,7 @@ class Film(NamedTuple):
     duration: int
     pause: int = 800
     part: int | None = None
+    quality: int = 90
 
 
 def main(description, make, **inputs):
@@ -86,7 +88,7 @@ def _animation(pictures, film):
     part = film.part or film.frames
     durations = [film.duration if (i + 1) % part else film.pause for i in range(film.frames)]
     options = {"save_all": True, "append_images": pictures[1:], "duration": durations, "loop": 0}
-    pictures[0].save(buffer, "WEBP", quality=90, method=4, **options)
+    pictures[0].save(buffer, "WEBP", quality=film.quality, method=4, **options)
     return buffer.getvalue()
 
 

@@ -161,6 +161,51 @@ def certify(*runs: Found) -> Rows:
     return markdown("answers by", columns, rows)
 
 
+DETECTORS = {
+    "exact": "`exact`",
+    "conservative": "`conservative`, the default",
+    "float": "`float`",
+    "cubic": "cubic solver",
+    "Tight Inclusion": "IPC Toolkit, Tight Inclusion",
+    "Tight Inclusion, rescaling 1": "the same, `conservative_rescaling=1`",
+    "additive": "IPC Toolkit, additive",
+}
+
+
+def detectors(found: Found) -> Rows:
+    """Queries that detectors miss, report falsely and do not decide, hand-made and adversarial ones."""
+    parts = {"hand-made": [], "adversarial": []}
+    for row in found["rows"]:
+        parts["hand-made" if row["queries"] == "hand-made" else "adversarial"].append(row)
+
+    def total(rows: Iterable[Found], key: str, detector: str = "exact") -> str:
+        return f"{sum(row[key] for row in rows if row['detector'] == detector):,}"
+
+    head = ["detector"]
+    for name, rows in parts.items():
+        head += [f"{name}: missed of {total(rows, 'colliding')}", f"false of {total(rows, 'free')}", "late"]
+    return [
+        tuple(head),
+        *(
+            (title, *(total(rows, key, name) for rows in parts.values() for key in ("missed", "false", "late")))
+            for name, title in DETECTORS.items()
+        ),
+    ]
+
+
+def detectors_missed(found: Found) -> Rows:
+    """Misses by the generator of adversarial queries, of the detectors that miss any."""
+    runs = pivot((row for row in found["rows"] if row["queries"] != "hand-made"), "queries", "detector")
+    names = [name for name in DETECTORS if any(row[name]["missed"] for row in runs.values())]
+    columns = [Column(DETECTORS[name], lambda row, name=name: row[name]["missed"]) for name in names]
+    rows = [
+        (f"`{queries}`, {row['exact']['colliding']:,} collide", row)
+        for queries, row in runs.items()
+        if any(row[name]["missed"] for name in names)
+    ]
+    return markdown("queries", columns, rows)
+
+
 def given_queries(found: Found) -> Rows:
     """Times of a query of public files by method, on one core."""
     titles = {"queries": "hand-made", "cloth-funnel": "simulated (cloth-funnel)"}

@@ -26,12 +26,14 @@ _GUIDES = "contacts", "gradients", "reports", "turning_bodies"
 PAGES = [
     ROOT / "README.md",
     ROOT / "docs" / "index.md",
+    ROOT / "docs" / "detectors.md",
     ROOT / "docs" / "intersections.md",
     ROOT / "docs" / "measurements.md",
     *(ROOT / "docs" / "newton" / f"{name}.md" for name in _GUIDES),
 ]
 MEASUREMENTS = ROOT / "warp_bsc" / "bench" / "measurements"
 _COMPARED = {
+    "ccd_peers": {"ipctk": "IPC Toolkit"},
     "detector": {"ipctk": "IPC Toolkit"},
     "intersections": {title: title for title in table_rows.ASKED},
     "penetration": {"mujoco": "MuJoCo", "pyuipc": "libuipc"},
@@ -68,6 +70,8 @@ TABLES = {
     "front": Table(("penetration_twist", "penetration_drape"), table_rows.front, has_sources=False),
     "front_detector": Table(("detector_gpu", "detector_two_cores"), table_rows.front_detector, has_sources=False),
     "arc_cost_cpu": Table(("arc_cost_cpu", "arc_cost_large_cpu"), table_rows.arc_cost),
+    "detectors": Table(("ccd_peers_cpu",), table_rows.detectors, has_sources=False),
+    "detectors_missed": Table(("ccd_peers_cpu",), table_rows.detectors_missed),
     "certify": Table(tuple(f"certify_{seed}_gpu" for seed in range(11, 15)), table_rows.certify),
     "given_queries": Table(("given_queries_one_core",), table_rows.given_queries),
     "detector": Table(("detector_gpu", "detector_two_cores", "detector_one_core"), table_rows.detector),

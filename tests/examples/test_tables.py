@@ -159,6 +159,26 @@ def test_certificates_of_several_runs():
     ]
 
 
+def test_detectors():
+    def row(queries, detector, missed, false, late):
+        counts = {"colliding": 1000, "free": 300, "missed": missed, "false": false, "late": late}
+        return {"queries": queries, "detector": detector} | counts
+
+    others = [row(name, detector, 0, 1, 2) for detector in rows_of.DETECTORS for name in ("hand-made", "a", "b")]
+    rows = [other for other in others if other["detector"] not in ("float", "additive")]
+    rows += [row(name, "float", 5, 6, 0) for name in ("hand-made", "a", "b")]
+    rows += [row("hand-made", "additive", 0, 4, 7), row("a", "additive", 0, 0, 1), row("b", "additive", 8, 0, 1)]
+    head, *totals = rows_of.detectors({"rows": rows})
+    assert head[1:4] == ("hand-made: missed of 1,000", "false of 300", "late")
+    assert head[4:] == ("adversarial: missed of 2,000", "false of 600", "late")
+    assert totals[0] == ("`exact`", "0", "1", "2", "0", "2", "4")
+    assert totals[2] == ("`float`", "5", "6", "0", "10", "12", "0")
+    assert totals[6] == ("IPC Toolkit, additive", "0", "4", "7", "8", "0", "2")
+    head, *missed = rows_of.detectors_missed({"rows": rows})
+    assert head == ("queries", "`float`", "IPC Toolkit, additive")
+    assert missed == [("`a`, 1,000 collide", "5", "0"), ("`b`, 1,000 collide", "5", "8")]
+
+
 def test_repairs_of_shots():
     row = {
         "shot": "a.usd",
