@@ -311,8 +311,10 @@ def test_coefficients_may_be_arrays_that_each_step_reads(device):
     model = bullet(10.0, device=device)
     for name, lengths in (("friction", (2, 0)), ("restitution", (model.particle_count,))):
         for length in lengths:
-            with pytest.raises(ValueError, match=f"{name} must be a number, or an array of float32 of length"):
+            with pytest.raises(ValueError, match=f"{name} must be a number, or a Warp array of float32 of length"):
                 bsc.SolverCCD(SOLVERS["xpbd"](model), **{name: wp.zeros(length, dtype=float, device=device)})
+        with pytest.raises(TypeError, match=f"{name} must be a number, or a Warp array of float32, not ndarray"):
+            bsc.SolverCCD(SOLVERS["xpbd"](model), **{name: np.zeros(model.particle_count)})
         with pytest.raises(ValueError, match=name):
             bsc.SolverCCD(SOLVERS["xpbd"](model), **{name: wp.full(1, -0.5, dtype=float, device=device)})
     ends = []

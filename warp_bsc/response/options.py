@@ -18,6 +18,7 @@ from .._arguments import (
     checked_integer,
     checked_number,
     checked_strings,
+    given,
 )
 from .._private_names.of_newton import has_external_rigid_solver
 from .state.friction import Friction
@@ -107,11 +108,13 @@ def checked_restitution(restitution, model: newton.Model) -> wp.array:
 
 def _checked_coefficients(value, name, lengths, most, limits, model):
     """Returns a coefficient, or an array of some, as an array."""
+    if isinstance(value, list | tuple | np.ndarray):
+        raise TypeError(f"{name} must be a number, or a Warp array of float32, not {given(value)}")
     if not isinstance(value, wp.array):
         values = np.full(1, checked_number(value, name))
     elif value.dtype is not wp.float32 or value.ndim != 1 or len(value) not in lengths:
         allowed = " or ".join(map(str, dict.fromkeys(lengths)))
-        raise ValueError(f"{name} must be a number, or an array of float32 of length {allowed}")
+        raise ValueError(f"{name} must be a number, or a Warp array of float32 of length {allowed}")
     else:
         values = value.numpy()
     if not ((values >= 0.0) & (values <= most)).all():

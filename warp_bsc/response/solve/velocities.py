@@ -134,12 +134,7 @@ def _sweep(cluster: int) -> wp.Kernel:
 
     @wp.kernel(module="unique", enable_backward=False, cluster_dim=cluster, launch_bounds=BLOCK)
     def sweep_velocities(
-        step: Step,
-        particles: Incidence,
-        tolerance: wp.float64,
-        batch: int,
-        sums: wp.array2d[wp.int64],
-        threads: int,
+        step: Step, particles: Incidence, tolerance: wp.float64, batch: int, sums: wp.array2d[wp.int64], threads: int
     ):
         """Solves velocities, with a new active set after each ``batch`` of sweeps, and restores angular momentum."""
         world = wp.tid() // threads
