@@ -82,6 +82,11 @@ def test_intersections(tmp_path, capsys):
     assert output.splitlines() == shown == ["True", "[3, 4] [0, 1, 2]", "True", "False"]
 
 
+def test_detectors(tmp_path, capsys):
+    _, output = run("detectors.md", tmp_path, capsys)
+    assert output == "[ True] [ True]\n"
+
+
 def test_kernels(tmp_path, capsys):
     names, output = run("kernels.md", tmp_path, capsys)
     assert names["count"].numpy().tolist() == [1] and output.startswith("[1]\n")

@@ -116,8 +116,8 @@ def _farthest(faces: _Faces, begin: int, end: int, poles: int):
 
 
 @wp.func
-def _mark_half(faces: _Faces, begin: int, split: int, end: int, axis: int):
-    """Sets the bit of an axis in those faces of a part that are in its second half along the axis, by counting."""
+def _fill_buckets(faces: _Faces, begin: int, end: int, axis: int):
+    """Writes the bucket along an axis, as the key, of the face at each place of a part, and how many faces each has."""
     axes = _AXES
     lowest, highest = int(2147483647), int(-2147483647)
     for i in range(begin, end):
@@ -133,6 +133,12 @@ def _mark_half(faces: _Faces, begin: int, split: int, end: int, axis: int):
         bucket = begin + ((faces.keys[i] - lowest) >> shift)
         faces.keys[i] = bucket
         faces.buckets[bucket] = faces.buckets[bucket] + 1
+
+
+@wp.func
+def _mark_half(faces: _Faces, begin: int, split: int, end: int, axis: int):
+    """Sets the bit of an axis in those faces of a part that would be in its second half, sorted along the axis."""
+    _fill_buckets(faces, begin, end, axis)
     middle = int(begin)
     left = split - begin  # places of the first half
     while faces.buckets[middle] <= left:
@@ -150,7 +156,7 @@ def _mark_half(faces: _Faces, begin: int, split: int, end: int, axis: int):
 
 @wp.func
 def _halve(faces: _Faces, begin: int, split: int, end: int):
-    """Orders a part by the half that its faces are in, along the axis whose halves share the fewest edges."""
+    """Sorts a part along the axis whose halves share the fewest edges, and cuts the links between these."""
     axes = wp.where(end - begin > _LARGE, 4, 8)
     for axis in range(axes):
         _mark_half(faces, begin, split, end, axis)
@@ -168,15 +174,16 @@ def _halve(faces: _Faces, begin: int, split: int, end: int):
     for axis in range(1, axes):
         if cuts[axis] < cuts[best]:
             best = axis
-    first, second = begin + int(0), split + int(0)
+    _fill_buckets(faces, begin, end, best)
+    place = int(begin)
     for i in range(begin, end):
-        face = faces.order[i]
-        if (faces.halves[face] >> best) & 1 == 0:
-            faces.queue[first] = face
-            first += 1
-        else:
-            faces.queue[second] = face
-            second += 1
+        size = faces.buckets[i]
+        faces.buckets[i] = place
+        place += size
+    for i in range(begin, end):
+        bucket = faces.keys[i]
+        faces.queue[faces.buckets[bucket]] = faces.order[i]
+        faces.buckets[bucket] = faces.buckets[bucket] + 1
     for i in range(begin, end):
         face = faces.queue[i]
         faces.order[i] = face
