@@ -42,6 +42,13 @@ def raised(x: Any, padding: wp.float64) -> wp.vec3:
 
 
 @wp.func
+def empty_box() -> BoxRows:
+    """Returns a box that overlaps none."""
+    low = wp.vec3(wp.inf, wp.inf, wp.inf)
+    return wp.matrix_from_rows(low, -low, low, -low)
+
+
+@wp.func
 def union_of_boxes(a: BoxRows, b: BoxRows) -> BoxRows:
     """Returns the smallest box around two."""
     return wp.matrix_from_rows(wp.min(a[0], b[0]), wp.max(a[1], b[1]), wp.min(a[2], b[2]), wp.max(a[3], b[3]))

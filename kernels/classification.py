@@ -94,10 +94,7 @@ def _classify_part(k: wp.vec4d, bound: wp.float64, tests: InsideTests, shape: in
     s1 = quadratic_signs(part.q1, part.bounds[1], part_k, part_bound, size, roots)
     s2 = quadratic_signs(part.q2, part.bounds[2], part_k, part_bound, size, roots)
     s3 = quadratic_signs(part.q3, part.bounds[3], part_k, part_bound, size, roots)
-    return either(
-        verdict(wp.vec4i(s0[0], s1[0], s2[0], s3[0])),
-        verdict(wp.vec4i(s0[1], s1[1], s2[1], s3[1])),
-    )
+    return either(verdict(wp.vec4i(s0[0], s1[0], s2[0], s3[0])), verdict(wp.vec4i(s0[1], s1[1], s2[1], s3[1])))
 
 
 @wp.func

@@ -104,14 +104,7 @@ def _size(x0: wp.vec3d, x1: wp.vec3d) -> wp.vec3d:
 
 @wp.func
 def _scaled(
-    kind: int,
-    roundoff: wp.float64,
-    u0: wp.vec3d,
-    u1: wp.vec3d,
-    v0: wp.vec3d,
-    v1: wp.vec3d,
-    w0: wp.vec3d,
-    w1: wp.vec3d,
+    kind: int, roundoff: wp.float64, u0: wp.vec3d, u1: wp.vec3d, v0: wp.vec3d, v1: wp.vec3d, w0: wp.vec3d, w1: wp.vec3d
 ) -> Motion:
     """Returns a relative motion, scaled exactly, by a power of two, to coordinates below 2.
 

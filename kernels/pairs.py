@@ -60,11 +60,12 @@ def is_filtered(pair_filter: PairFilter, element: wp.vec3i, other: wp.vec3i) -> 
 def finite_elements(owned: int, a: bool, b: bool, c: bool) -> int:
     """Returns what a face represents without the elements that have a corner that is not finite.
 
-    Bits 0 to 2 of ``owned`` are the vertices at the corners, bits 3 to 5 the edges from a corner to the next.
+    Bits 0 to 2 of ``owned`` are the vertices at the corners, bits 3 to 5 the edges from a corner to the next, bit 6 the
+    face itself.
     """
     finite = wp.where(a, 1, 0) | wp.where(b, 2, 0) | wp.where(c, 4, 0)
     next = (finite >> 1) | ((finite & 1) << 2)
-    return owned & (finite | ((finite & next) << 3))
+    return owned & (finite | ((finite & next) << 3) | wp.where(finite == 7, 64, 0))
 
 
 @wp.func

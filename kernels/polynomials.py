@@ -138,9 +138,7 @@ def _cross_component(x0: wp.vec3d, x1: wp.vec3d, y0: wp.vec3d, y1: wp.vec3d, axi
     y1j = component(y1, j)
     y1k = component(y1, k)
     return wp.vec3d(
-        x0j * y0k - x0k * y0j,
-        HALF * ((x0j * y1k - x0k * y1j) + (x1j * y0k - x1k * y0j)),
-        x1j * y1k - x1k * y1j,
+        x0j * y0k - x0k * y0j, HALF * ((x0j * y1k - x0k * y1j) + (x1j * y0k - x1k * y0j)), x1j * y1k - x1k * y1j
     )
 
 

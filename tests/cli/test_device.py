@@ -29,7 +29,7 @@ def test_one_line_says_that_kernels_are_compiled(log_level, load, monkeypatch, t
     load()  # from the cache
     compilation.report_compilation(is_cpu=True)  # of another module
     said = [line for line in capsys.readouterr().out.splitlines() if line.startswith("warp-bsc: ")]
-    expected = "warp-bsc: compiling kernels for the CPU, once for each version: about half a minute of processor time. "
+    expected = "warp-bsc: compiling kernels for the CPU, once for each version: half a minute of processor time, two minutes for a solver. "
     assert said == [f"{expected}They are kept in {tmp_path}"] * (log_level == wp.LOG_INFO)
 
 
@@ -48,7 +48,7 @@ def test_long_compilations_show_their_progress(monkeypatch, capsys):
         for _ in range(6):
             compilation.report_compilation(is_cpu=True)
     assert capsys.readouterr().err.splitlines() == [
-        "Compiling kernels for cpu, once for each version: about half a minute of processor time.",
+        "Compiling kernels for cpu, once for each version: half a minute of processor time, two minutes for a solver.",
         "Compiling kernels: 4 modules in 14 s.",
     ]
     compilation.report_compilation(is_cpu=True)

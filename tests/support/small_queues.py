@@ -10,9 +10,9 @@ from warp_bsc.detection.broad.broad_phase_hierarchy import BroadPhaseHierarchy
 CAPACITY = 4
 
 
-def _make_hierarchy(mesh, count, *, capacity=None, not_finite=None, checked_vertices=None, **options):
+def _make_hierarchy(mesh, count, *, capacity=None, not_finite=None, only_used_vertices=False, **options):
     """The broad phase of a GPU, which stages on the CPU get here too."""
-    assert checked_vertices is None
+    assert not only_used_vertices
     return BroadPhaseHierarchy(mesh, count, capacity=capacity, not_finite=not_finite, **options)
 
 

@@ -1,7 +1,6 @@
 """The collision mesh: the faces, edges and vertices for collision detection."""
 
 import functools
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,28 +10,12 @@ from numpy.typing import ArrayLike
 from .._arguments import as_numpy, checked_bits, checked_distances, checked_flag, checked_integer, checked_shape
 from .._sorted_keys import expand_ranges
 from ..kernels.pairs import PairFilter
+from ..kernels.pipeline.corners import IS_FACE
 from .face_order import order_faces
 from .run.settings import PairKind
 from .run.start import checked_device
 
 _MOST_LISTED = 31
-
-
-@dataclass(frozen=True, eq=False)
-class DevicePlaces:
-    """What is at the places of the broad phase's hierarchy, which detectors of a mesh share: Warp arrays of int.
-
-    Attributes:
-        order: Cell at each place, -1 for none.
-        faces: Vertices of the cell at each place, two-dimensional.
-        face_edges: Edges of the cell at each place, two-dimensional.
-        owned: The elements whose representative the cell at each place is.
-    """
-
-    order: wp.array
-    faces: wp.array
-    face_edges: wp.array
-    owned: wp.array
 
 
 class ElementsOfParts(NamedTuple):
@@ -214,9 +197,10 @@ class CollisionMesh:
 
     @functools.cached_property
     def cell_owned(self) -> np.ndarray:
-        """What each cell is the representative of, as ``owned``, int32, shape [n]."""
+        """What each cell is the representative of, as ``owned``, and :data:`IS_FACE`, int32, shape [n]."""
         first, last = len(self.faces), len(self.faces) + len(self.free_edges)
-        owned = np.concatenate([self.owned, np.full(last - first, 8), np.ones(len(self.points))]).astype(np.int32)
+        owned = np.concatenate([self.owned | IS_FACE, np.full(last - first, 8), np.ones(len(self.points))])
+        owned = owned.astype(np.int32)
         ends, first_ends = np.unique(self.cells[first:last, :2], return_index=True)
         first_ends = first_ends[~np.isin(ends, self.faces)]
         np.bitwise_or.at(owned, first + first_ends // 2, 1 << (first_ends % 2))
@@ -255,21 +239,17 @@ class CollisionMesh:
         return order_faces(self.cells, None if self.world is None else self.world[self.cells[:, 0]])
 
     @functools.cached_property
-    def device_places(self) -> "DevicePlaces":
-        """What is at the places of the hierarchy, on the device."""
+    def device_places(self) -> tuple[wp.array, ...]:
+        """What is at the places of the hierarchy, on the device, for detectors to share, arrays of int.
+
+        The cell, -1 for none; its vertices, and what it is the representative of, shape [n, 4]; its edges, [n, 3].
+        """
         order = self.face_order
-
-        def array(values: np.ndarray) -> wp.array:
-            return wp.array(values.astype(np.int32, copy=False), dtype=int, device=self.device)
-
-        def by_place(values: np.ndarray) -> wp.array:
-            return array(values[order] if len(order) else values)
-
-        return DevicePlaces(
-            order=array(order),
-            faces=by_place(self.cells),
-            face_edges=by_place(self.cell_edges),
-            owned=by_place(self.cell_owned),
+        of_cells = np.column_stack([self.cells, self.cell_owned]), self.cell_edges
+        by_place = [values[order] if len(order) else values for values in of_cells]
+        return tuple(
+            wp.array(values.astype(np.int32, copy=False), dtype=int, device=self.device)
+            for values in (order, *by_place)
         )
 
     @functools.cached_property

@@ -14,7 +14,7 @@ from .narrow.rules.approach import MinDistances, run_approaches
 from .narrow.rules.arc import run_arcs
 from .narrow.rules.contact import run_contacts
 from .narrow.rules.distance import run_distances
-from .run.launch import launch, made_once
+from .run.launch import launch
 from .run.phase_timer import PhaseTimer
 from .run.settings import (
     METHODS,
@@ -52,28 +52,6 @@ def _add_deviations(
     added = deviation[vertex]
     pad = padding[vertex]
     padding_on_arcs[vertex] = wp.where(added > _ZERO, ABOVE_SUM * (pad + added), pad)
-
-
-@made_once
-def _count_not_finite(dtype: type) -> wp.Kernel:
-    """Returns the kernel that counts positions that are not finite, for one type of position."""
-
-    @wp.kernel(**NO_GRADIENTS)
-    def count_not_finite(
-        # in
-        x0: wp.array[dtype],
-        x1: wp.array[dtype],
-        vertices: wp.array[int],
-        # out
-        count: wp.array[wp.int64],
-    ):
-        vertex = wp.tid()
-        if vertices:
-            vertex = vertices[vertex]
-        if not (wp.isfinite(x0[vertex]) and wp.isfinite(x1[vertex])):
-            wp.atomic_add(count, 0, wp.int64(1))
-
-    return count_not_finite
 
 
 def _radius(mesh: CollisionMesh, min_distance: float) -> np.ndarray | None:
@@ -168,7 +146,6 @@ class DetectionPipeline:
         self.method: Method = method
         self.tolerance = tolerance
         self.generation = 0
-        self._checked_vertices = mesh.device_vertices if only_used_vertices else None
         self._captured = False
         self._retired: list = []  # buffers that a CUDA graph may still write to
         self.counters = Counters(mesh.device)
@@ -207,7 +184,7 @@ class DetectionPipeline:
             self.counters.face_pairs,
             capacity=face_pairs,
             not_finite=self.counters.not_finite,
-            checked_vertices=mesh.vertices if only_used_vertices else None,
+            only_used_vertices=only_used_vertices,
             padding=padding,
         )
         self.vertex_face = NarrowPhase(
@@ -334,12 +311,8 @@ class DetectionPipeline:
         """
         self._pad_arcs()
         self.counters.array.zero_()
-        options = {"changed": changed, "keep_separated": keep_separated}
-        self.broad_phase.pair_elements(x0, x1, *_queues(self.vertex_face, self.edge_edge), **options)
-        if self.points:
-            self.broad_phase.pair_points(x0, x1, *_queues(*self.points), **options)
-        if self.mesh.device.is_cpu:
-            self._launch_count_not_finite(x0, x1)
+        queues = _queues(*self.narrow_phases)
+        self.broad_phase.pair_elements(x0, x1, *queues, changed=changed, keep_separated=keep_separated)
 
     def find_edges_with_faces(self, x: wp.array) -> None:
         """Enqueues the pairs (edge, face) of one configuration whose boxes overlap, in the queue of edge-edge pairs.
@@ -399,10 +372,3 @@ class DetectionPipeline:
         capacities = self._host_capacities()
         self.capacities = wp.array(capacities.values(), dtype=wp.int64, device=self.mesh.device)
         self._known_capacities = capacities  # once the device has them
-
-    def _launch_count_not_finite(self, x0: wp.array, x1: wp.array) -> None:
-        """Launches the count on the CPU; the broad phase of a GPU counts while it boxes the elements."""
-        vertices, device = self._checked_vertices, self.mesh.device
-        dim = self.mesh.vertex_count if vertices is None else len(vertices)
-        inputs, outputs = [x0, x1, vertices], [self.counters.not_finite]
-        launch(_count_not_finite(x0.dtype), dim, inputs=inputs, outputs=outputs, device=device, record_tape=False)

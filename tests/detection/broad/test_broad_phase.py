@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from sheets import crumpled, grid
 
 import warp_bsc as bsc
+from warp_bsc.detection.broad import broad_phase_hierarchy, face_hierarchy
 from warp_bsc.detection.broad.broad_phase_hierarchy import BroadPhaseHierarchy
 from warp_bsc.detection.broad.broad_phase_simd import BroadPhaseSimd
 from warp_bsc.detection.broad.face_hierarchy import traversal_kernel
@@ -167,9 +168,11 @@ def sorted_face_pairs(mesh, x0, x1, keep_separated=False):
     return in_order(np.stack([a, b], axis=1), len(mesh.faces))
 
 
+@pytest.mark.parametrize("few_nodes", [face_hierarchy.FEW_NODES, 0])
 @pytest.mark.parametrize("worlds", [1, 3])
-def test_many_bundles(worlds):
-    """More bundles than a warp tests at once, of one sheet that moves through itself."""
+def test_many_bundles(worlds, few_nodes, monkeypatch):
+    """More bundles than a warp tests at once, of one sheet that moves through itself; with groups of them as well."""
+    monkeypatch.setattr(face_hierarchy, "FEW_NODES", few_nodes)
     n = 132 if worlds == 1 else 76
     x0, x1, faces = crumpled(0, n)
     world = None
@@ -183,6 +186,27 @@ def test_many_bundles(worlds):
         found = face_pairs(mesh, x0, x1, keep_separated=keep_separated)
         assert len(found) > 10 * len(faces)
         np.testing.assert_array_equal(found, sorted_face_pairs(mesh, x0, x1, keep_separated))
+
+
+def test_parts_of_a_large_mesh(monkeypatch, device):
+    """The queue of pairs of faces need only hold those of one part, whose count is the largest."""
+    x0, x1, faces = crumpled(0)
+    mesh = bsc.CollisionMesh(faces, len(x0), device=device)
+    positions = [wp.array(x, dtype=wp.vec3, device=mesh.device) for x in (x0, x1)]
+    found = []
+    for clusters in (1000, 3):
+        monkeypatch.setattr(broad_phase_hierarchy, "CLUSTERS_OF_PART", clusters)
+        count = wp.zeros(1, dtype=wp.int64, device=mesh.device)
+        finder = BroadPhaseHierarchy(mesh, count, capacity=found[0][0] // 2 if found else 1_000_000)
+        counts = wp.zeros((2, len(Count)), dtype=wp.int64, device=mesh.device)
+        queues = [wp.empty(400_000, dtype=wp.vec2i, device=mesh.device) for _ in range(2)]
+        finder.pair_elements(*positions, counts[0], queues[0], counts[1], queues[1])
+        sizes = counts.numpy()[:, Count.QUEUED]
+        pairs = [in_lexicographic_order(queue.numpy()[:size]) for queue, size in zip(queues, sizes, strict=True)]
+        found.append((int(count.numpy()[0]), pairs))
+    assert 0 < found[1][0] < found[0][0] // 2
+    assert min(len(pairs) for pairs in found[0][1]) > 1000
+    assert found[0][1] == found[1][1]
 
 
 def test_pairs_of_faces_of_which_one_has_changed():
@@ -359,8 +383,7 @@ def test_both_broad_phases_find_the_same(device, dtype, keep_separated, padding)
         counts = [wp.zeros(len(Count), dtype=wp.int64, device=mesh.device) for _ in range(4)]
         queues = [wp.zeros(100_000, dtype=wp.vec2i, device=mesh.device) for _ in range(4)]
         inputs = [array for pair in zip(counts, queues, strict=True) for array in pair]
-        finder.pair_elements(*ends, *inputs[:4], keep_separated=keep_separated)
-        finder.pair_points(*ends, *inputs[4:], keep_separated=keep_separated)
+        finder.pair_elements(*ends, *inputs, keep_separated=keep_separated)
         numbers = [count.numpy() for count in counts]
         of_kinds = [queue.numpy()[: n[Count.QUEUED]] for queue, n in zip(queues, numbers, strict=True)]
         found.append(([in_lexicographic_order(pairs) for pairs in of_kinds], [n[Count.FILTERED] for n in numbers]))

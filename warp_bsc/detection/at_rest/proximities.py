@@ -261,8 +261,7 @@ class ProximityFinder:
         queues = [array for queue in self._queues for array in (queue.counts, queue.candidates)]
         # all positions move from lower to upper: an axis that separates two elements at both ends may not separate
         # their enlarged boxes
-        self._broad_phase.pair_elements(lower, upper, *queues[:4], keep_separated=True)
-        self._broad_phase.pair_points(lower, upper, *queues[4:], keep_separated=True)
+        self._broad_phase.pair_elements(lower, upper, *queues, keep_separated=True)
         for queue in self._queues:
             queue.launch(x, self._mesh.device_elements(queue.kind), self._rings, self._distance)
 

@@ -26,7 +26,7 @@ def make_broad_phase(
     *,
     capacity: int | None = None,
     not_finite: wp.array | None = None,
-    checked_vertices: np.ndarray | None = None,
+    only_used_vertices: bool = False,
     padding: wp.array | None = None,
 ) -> BroadPhase:
     """Returns the broad phase for a mesh's device.
@@ -35,15 +35,16 @@ def make_broad_phase(
         mesh: The mesh.
         count: Number of pairs of faces found, zero before each run, array of one int64.
         capacity: Capacity for pairs of faces at first, on a GPU; None for the default.
-        not_finite: Number of vertices with a position that is not finite, array of one int64, which a run on a GPU adds
-            to; None to count none.
-        checked_vertices: Indices of the vertices that are counted; None for all.
+        not_finite: Number of vertices with a position that is not finite, array of one int64, which a run adds to; None
+            to count none.
+        only_used_vertices: Whether vertices that no face uses are not counted.
         padding: How far the box of each vertex reaches beyond it, those of an edge or a face as far as the largest of
             its vertices, array of float64; None for boxes without a padding.
     """
+    options = {"not_finite": not_finite, "checked": None, "padding": padding}
+    if only_used_vertices and len(mesh.vertices) < mesh.vertex_count:
+        used = np.isin(np.arange(mesh.vertex_count), mesh.vertices)
+        options["checked"] = wp.array(used, dtype=int, device=mesh.device)
     if mesh.device.is_cpu:
-        return BroadPhaseSimd(mesh, count, padding=padding)
-    checked = None
-    if checked_vertices is not None and len(checked_vertices) < mesh.vertex_count:
-        checked = wp.array(np.isin(np.arange(mesh.vertex_count), checked_vertices), dtype=int, device=mesh.device)
-    return BroadPhaseHierarchy(mesh, count, capacity=capacity, not_finite=not_finite, checked=checked, padding=padding)
+        return BroadPhaseSimd(mesh, count, **options)
+    return BroadPhaseHierarchy(mesh, count, capacity=capacity, **options)

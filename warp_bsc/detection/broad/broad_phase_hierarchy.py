@@ -1,6 +1,7 @@
 """The broad phase of a GPU: one traversal of a hierarchy of boxes over the faces finds all pairs of elements."""
 
 import threading
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import warp as wp
@@ -9,15 +10,29 @@ from ...kernels.pipeline.hierarchy import WIDTH, count_set_bits, lowest_set_bit
 from ...kernels.pipeline.queues import take_slots, write
 from ..mesh import CollisionMesh
 from ..run.launch import THREADS_OF_MULTIPROCESSOR, launch
-from ..run.settings import capacity_for
+from ..run.settings import NO_GRADIENTS, capacity_for
 from .element_pairs import Pairs, pair_edges_with_faces_kernel, pair_elements_kernel, pair_points_kernel
-from .face_hierarchy import box_bundles, bundle_count, fit_kernel, make_hierarchy, traversal_kernel
+from .face_hierarchy import box_parents, fit_kernel, make_hierarchy, round_kernel, traversal_kernel
 
 _WARPS_OF_MULTIPROCESSOR = 128
 """Number of warps to aim at for a multiprocessor of a GPU in a traversal."""
 _MAX_WARPS_OF_CLUSTER = 16
+CLUSTERS_OF_PART = 2**15
+"""Clusters that are traversed at once: a million faces, whose pairs then leave the queue before those of others."""
 _TRAVERSAL_BLOCK = 128
 """Threads of a block of a traversal."""
+
+
+@wp.kernel(**NO_GRADIENTS)
+def _keep_largest(
+    # in
+    counts: wp.array[wp.int64],
+    # out
+    largest: wp.array[wp.int64],
+):
+    """Writes the largest of some counts."""
+    for i in range(counts.shape[0]):
+        largest[0] = wp.max(largest[0], counts[i])
 
 
 @wp.func
@@ -35,7 +50,8 @@ class BroadPhaseHierarchy:
     Attributes:
         lock: Held by each user of the broad phase from a run until its queues have been read.
         hierarchy: The hierarchy on the device; a run fits its boxes.
-        face_pairs: The queue of the pairs of faces that a run finds, by place, array of vec2i.
+        face_pairs: The queue of the pairs of faces that a run finds, by place, array of vec2i; of a large mesh those of
+            one part after the other, of which the count is the largest.
     """
 
     def __init__(
@@ -53,27 +69,26 @@ class BroadPhaseHierarchy:
         Args:
             mesh: The mesh.
             count: Number of pairs of faces found, zero before each run, array of one int64.
-            capacity: Capacity of the queue at first; default: eight pairs a face.
+            capacity: Capacity of the queue at first; default: eight pairs a face of a part.
             not_finite: Number of vertices with a position that is not finite, which a run adds to, array of one int64;
                 None to count none.
             checked: Nonzero for each vertex that is counted, array of int; None for all.
             padding: How far the boxes of each vertex and its elements reach beyond them, array of float64, or None.
         """
         self.lock = threading.RLock()
-        self._padding, self._swept = padding, False
+        self._padding, self._has_points, self._vertex_count = padding, len(mesh.points) > 0, mesh.vertex_count
         self._device = device = mesh.device
         self._count = count
         self._not_finite, self._checked = not_finite, checked
         self.hierarchy = make_hierarchy(mesh, padded=padding is not None)
         places = len(mesh.face_order)
-        self._fitted = places + (0 if not_finite is None else mesh.vertex_count)
         self._clusters = places // WIDTH
-        self._bundles = bundle_count(places)
         self._warps_of_cluster = 1
         if device.is_cuda and self._clusters:
             warps = _WARPS_OF_MULTIPROCESSOR * device.sm_count // self._clusters
             self._warps_of_cluster = max(1, min(_MAX_WARPS_OF_CLUSTER, warps))
-        capacity = 8 * len(mesh.cells) if capacity is None else capacity
+        self._part_counts = wp.zeros(max(1, self._clusters // CLUSTERS_OF_PART), dtype=wp.int64, device=device)
+        capacity = 8 * len(mesh.cells) // len(self._part_counts) if capacity is None else capacity
         self.face_pairs = wp.empty(capacity, dtype=wp.vec2i, device=device)
 
     @property
@@ -109,23 +124,16 @@ class BroadPhaseHierarchy:
             x0: Positions at the start, array of vec3 or vec3d.
             x1: Positions at the end, of the same type.
             out: Counts by :class:`Count`, array of int64, and queue for (vertex, face), array of vec2i; then those for
-                (edge, edge), the smaller first.
+                (edge, edge), the smaller first; if pairs of points are sought also those for (point, edge), of edges
+                that no face has, and for (point, point), the smaller first.
             changed: Nonzero for each vertex whose pairs are sought, array of int; None for all. More than 1, by body,
                 for those of rigid bodies, within which none are. What is not sought may be found as well.
             keep_separated: Whether to enqueue the pairs that an axis separates, too.
         """
-        self.pair_faces(x0, x1, changed, keep_separated)
-        self._launch_over_pairs(pair_elements_kernel, *out)
-
-    def pair_points(
-        self, x0: wp.array, x1: wp.array, *out: wp.array, changed: wp.array | None = None, keep_separated: bool = False
-    ) -> None:
-        """Enqueues the candidates of points with the edges that no face has, and with points.
-
-        Call it after :meth:`pair_elements`, whose pairs of cells it reads, with the same arguments but queues for
-        (point, edge) and (point, point), the smaller first. A mesh without points has none.
-        """
-        self._launch_over_pairs(pair_points_kernel, *out)
+        launches = [(pair_elements_kernel, out[:4])]
+        if self._has_points and out[4:]:
+            launches.append((pair_points_kernel, out[4:]))
+        self.pair_faces(x0, x1, changed, keep_separated, *launches)
 
     def pair_edges_with_faces(self, x: wp.array, counts: wp.array, pairs: wp.array, *, is_end: bool = False) -> None:
         """Enqueues the pairs (edge, face) of one configuration that share no vertex and whose boxes overlap.
@@ -137,36 +145,63 @@ class BroadPhaseHierarchy:
             is_end: Whether the positions are those at the end of the motion in the last :meth:`pair_elements`, whose
                 boxes are reused on a CPU.
         """
-        self.pair_faces(x, x)
-        self._launch_over_pairs(pair_edges_with_faces_kernel, counts, pairs)
+        self.pair_faces(x, x, None, False, (pair_edges_with_faces_kernel, (counts, pairs)))
 
     def fit(self, x0: wp.array, x1: wp.array, changed: wp.array | None = None, *, keep_separated: bool = False) -> None:
         """Writes the corners and the boxes of all faces, and boxes all nodes; arguments as of :meth:`pair_elements`."""
-        self._swept = keep_separated
-        inputs = [x0, x1, changed, self._checked, self._padding, keep_separated, self.hierarchy]
-        outputs = [self._not_finite]
-        kernel = fit_kernel(x0.dtype, self.is_padded)
-        launch(kernel, self._fitted, inputs=inputs, outputs=outputs, device=self._device, record_tape=False)
-        if self._bundles:
-            inputs = [self.hierarchy.clusters, self.hierarchy.bundles]
-            launch(box_bundles, WIDTH * self._bundles, inputs=inputs, device=self._device, record_tape=False)
+        tree, options = self.hierarchy, {"device": self._device, "record_tape": False}
+        if not self.is_padded or self._not_finite is not None:
+            inputs, outputs = [x0, x1, self._checked], [None if self.is_padded else tree.corners, self._not_finite]
+            launch(round_kernel(x0.dtype), self._vertex_count, inputs=inputs, outputs=outputs, **options)
+        inputs = [x0, x1, changed, self._padding, keep_separated, tree]
+        launch(fit_kernel(x0.dtype, self.is_padded), len(tree.order), inputs=inputs, **options)
+        for children, parents in ((tree.clusters, tree.bundles), (tree.bundles, tree.groups)):
+            if parents.boxes is not None:
+                launch(box_parents, WIDTH * len(parents.boxes), inputs=[children, parents], **options)
 
-    def traverse(self, kernel: wp.Kernel, arguments: Any) -> None:
-        """Launches a kernel of :func:`traversal_kernel` over the hierarchy, whose boxes were fitted, on no tape."""
-        threads = self._clusters * self._warps_of_cluster * WIDTH
-        inputs = [self.hierarchy, self._warps_of_cluster, arguments]
+    def traverse(self, kernel: wp.Kernel, arguments: Any, first: int = 0, end: int | None = None) -> None:
+        """Launches a kernel of :func:`traversal_kernel` over the hierarchy, whose boxes were fitted, on no tape.
+
+        Args:
+            kernel: The kernel.
+            arguments: Its last argument.
+            first: First cluster whose pairs with itself and later ones are visited.
+            end: Last one, plus one; None for all.
+        """
+        threads = ((self._clusters if end is None else end) - first) * self._warps_of_cluster * WIDTH
+        inputs = [self.hierarchy, first, self._warps_of_cluster, arguments]
         launch(kernel, threads, inputs=inputs, device=self._device, block_dim=_TRAVERSAL_BLOCK, record_tape=False)
 
-    def pair_faces(self, x0: wp.array, x1: wp.array, changed: wp.array | None = None, keep_separated=False) -> None:
-        """Enqueues the pairs of faces that no axis separates, or all whose swept boxes overlap, each once."""
-        self.fit(x0, x1, changed, keep_separated=keep_separated)
-        self.traverse(traversal_kernel(_enqueue_faces, Pairs), _queue_of(self._count, self.face_pairs))
+    def pair_faces(
+        self,
+        x0: wp.array,
+        x1: wp.array,
+        changed: wp.array | None = None,
+        keep_separated: bool = False,
+        *launches: tuple[Callable[[bool, bool], wp.Kernel], Sequence[wp.array]],
+    ) -> None:
+        """Enqueues the pairs of faces that no axis separates, or all whose swept boxes overlap, each once.
 
-    def _launch_over_pairs(self, make_kernel, *out):
+        Those of each part of a large mesh take the place of those of the part before, once kernels have gone over them:
+        functions that make a kernel for boxes with a padding or without, swept or not, and its counts and queues.
+        """
+        self.fit(x0, x1, changed, keep_separated=keep_separated)
+        parts = len(self._part_counts)
+        if parts > 1:
+            self._part_counts.zero_()
+        options = {"device": self._device, "record_tape": False}
         threads = WIDTH if self._device.is_cpu else THREADS_OF_MULTIPROCESSOR * self._device.sm_count
-        queues = [_queue_of(counts, pairs) for counts, pairs in zip(out[::2], out[1::2], strict=True)]
-        inputs = [self.hierarchy, _queue_of(self._count, self.face_pairs), *queues, threads]
-        launch(make_kernel(self.is_padded, self._swept), threads, inputs=inputs, device=self._device, record_tape=False)
+        for part in range(parts):
+            count = self._part_counts[part : part + 1] if parts > 1 else self._count
+            ends = [self._clusters * i // parts for i in (part, part + 1)]
+            pairs = _queue_of(count, self.face_pairs)
+            self.traverse(traversal_kernel(_enqueue_faces, Pairs), pairs, *ends)
+            for make_kernel, out in launches:
+                queues = [_queue_of(*queue) for queue in zip(out[::2], out[1::2], strict=True)]
+                kernel = make_kernel(self.is_padded, keep_separated)
+                launch(kernel, threads, inputs=[self.hierarchy, pairs, *queues, threads], **options)
+        if parts > 1:
+            launch(_keep_largest, 1, inputs=[self._part_counts], outputs=[self._count], **options)
 
 
 def _queue_of(counts, pairs):

@@ -7,7 +7,9 @@ import numpy as np
 import warp as wp
 
 from ..mesh import CollisionMesh
+from ..run.launch import launch
 from ..run.settings import UNLIMITED
+from .face_hierarchy import round_kernel
 from .wide_tree import WideTree, sort_trees
 
 
@@ -23,8 +25,17 @@ class BroadPhaseSimd:
     buffers: tuple[wp.array, ...] = ()
     capacity: int = UNLIMITED
 
-    def __init__(self, mesh: CollisionMesh, count: wp.array, *, padding: wp.array | None = None):
-        """Allocates trees over the elements of a mesh, with padding as of :class:`.BroadPhaseHierarchy`."""
+    def __init__(
+        self,
+        mesh: CollisionMesh,
+        count: wp.array,
+        *,
+        not_finite: wp.array | None = None,
+        checked: wp.array | None = None,
+        padding: wp.array | None = None,
+    ):
+        """Allocates trees over the elements of a mesh; arguments as of :class:`.BroadPhaseHierarchy`."""
+        self._vertex_count, self._checked, self._not_finite = mesh.vertex_count, checked, not_finite
         self.lock = threading.RLock()
         self._filtered_of_worlds: wp.array | None = None
         shared = mesh.world, padding, mesh.pair_filter
@@ -65,20 +76,17 @@ class BroadPhaseSimd:
         self._build(trees, x0, x1, changed)
         options = {"keep_separated": keep_separated, "filtered_of_worlds": self._filtered_of_worlds}
         self._vertices.pair(self._faces, *out[:2], **options)
-        self._edges.pair(self._edges, *out[2:], ordered=True, **options)
+        self._edges.pair(self._edges, *out[2:4], ordered=True, **options)
         if self._edges_of_faces:
-            self._edges.pair(self._edges_of_faces, *out[2:], ordered=True, **options)
-
-    def pair_points(
-        self, x0: wp.array, x1: wp.array, *out: wp.array, changed: wp.array | None = None, keep_separated: bool = False
-    ) -> None:
-        """Enqueues the candidates of points with edges that no face has, and with points."""
-        if self._points is None or self._free_edges is None:
-            return
-        self._build([self._points, self._free_edges], x0, x1, changed)
-        options = {"keep_separated": keep_separated, "filtered_of_worlds": self._filtered_of_worlds}
-        self._points.pair(self._free_edges, *out[:2], **options)
-        self._points.pair(self._points, *out[2:], ordered=True, **options)
+            self._edges.pair(self._edges_of_faces, *out[2:4], ordered=True, **options)
+        if self._points and self._free_edges and out[4:]:
+            self._build([self._points, self._free_edges], x0, x1, changed)
+            self._points.pair(self._free_edges, *out[4:6], **options)
+            self._points.pair(self._points, *out[6:], ordered=True, **options)
+        if self._not_finite is not None:
+            inputs, outputs = [x0, x1, self._checked], [None, self._not_finite]
+            options = {"device": x0.device, "record_tape": False}
+            launch(round_kernel(x0.dtype), self._vertex_count, inputs=inputs, outputs=outputs, **options)
 
     def pair_vertices_with_faces(self, counts: wp.array, pairs: wp.array) -> None:
         """Enqueues the (vertex, face) whose boxes in the last run overlap, with arguments as of the others."""

@@ -6,15 +6,16 @@ import warp as wp
 
 from ...kernels.bits import lowest_bit
 from ...kernels.boxes import BoxRows
-from ...kernels.pairs import is_filtered
+from ...kernels.pairs import finite_elements, is_filtered
 from ...kernels.pipeline.corners import (
     IS_FACE,
     Corners,
     PaddedCorners,
+    corner_is_finite,
     edge_box,
     face_box,
+    read_cell,
     read_corners,
-    read_label,
     read_padded_corners,
     vertex_box,
 )
@@ -131,19 +132,22 @@ def pair_functions(padded: bool, swept: bool) -> PairFunctions:
         """What a thread reads of the cell at a place."""
 
         vertices: wp.vec3i
-        elements: int  # what it represents, as bits, see :mod:`warp_bsc.kernels.pipeline.corners`
+        elements: int  # what of it is finite, as bits, see :mod:`warp_bsc.kernels.pipeline.corners`
         corners: PaddedCorners if padded else Corners
 
     @wp.func
     def cell_at(mesh: FaceHierarchy, place: int) -> Cell:
         cell = Cell()
-        label = read_label(mesh.corners, place)
+        read = read_cell(mesh.faces, place)
         if wp.static(padded):
             cell.corners = read_padded_corners(mesh.corners, place)
         else:
-            cell.corners = read_corners(mesh.corners, place)
-        cell.vertices = wp.vec3i(label[0], label[1], label[2])
-        cell.elements = label[3]
+            cell.corners = read_corners(mesh.corners, read)
+        cell.vertices = wp.vec3i(read[0], read[1], read[2])
+        a_finite = corner_is_finite(cell.corners, 0)
+        b_finite = corner_is_finite(cell.corners, 1)
+        c_finite = corner_is_finite(cell.corners, 2)
+        cell.elements = finite_elements(read[3], a_finite, b_finite, c_finite)
         return cell
 
     @wp.func
@@ -239,14 +243,7 @@ def pair_elements_kernel(padded: bool, swept: bool) -> wp.Kernel:
     unseparated_pairs = pair_functions(padded, swept).element_pairs
 
     @wp.func
-    def pair_some(
-        mesh: FaceHierarchy,
-        face_pairs: Pairs,
-        first: int,
-        turns: int,
-        vertex_face: Pairs,
-        edge_edge: Pairs,
-    ):
+    def pair_some(mesh: FaceHierarchy, face_pairs: Pairs, first: int, turns: int, vertex_face: Pairs, edge_edge: Pairs):
         """Enqueues the candidates of some pairs of faces: ``first``, and each that is a warp further."""
         found = wp.uint64(0)
         queued = wp.vec2i()  # vertex-face, edge-edge

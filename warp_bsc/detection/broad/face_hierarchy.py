@@ -4,6 +4,8 @@ The hierarchy is made once, from the connectivity of the mesh, see :mod:`.face_o
 compact however a mesh moves. A run only fits its boxes. Edges that no face has and points have places as well, as faces
 that have collapsed: the cells of the mesh are its faces, then these edges, then the points. Cells without neighbours
 are in no order, and in the worst case are compared by brute force, 1,024 pairs of cells at a time.
+
+Each node has 32 children: faces, clusters, bundles, and groups, all of which a traversal tests with each cluster.
 """
 
 from collections.abc import Callable
@@ -11,19 +13,19 @@ from collections.abc import Callable
 import numpy as np
 import warp as wp
 
-from ...kernels.boxes import BoxRows, read_box, union_of_boxes, write_box
-from ...kernels.pairs import PairFilter, finite_elements
+from ...kernels.boxes import BoxRows, empty_box, read_box, rounded, union_of_boxes, write_box
+from ...kernels.pairs import PairFilter
 from ...kernels.pipeline.corners import (
-    IS_FACE,
     PADDED_ROW,
     ROW,
-    Corners,
     PaddedCorners,
-    face_box,
+    corner_is_finite,
+    read_cell,
+    read_corners,
     vertex_box,
-    with_corner,
-    write_corners,
+    with_padded_corner,
     write_padded_corners,
+    write_vertex,
 )
 from ...kernels.pipeline.hierarchy import (
     WIDTH,
@@ -40,8 +42,8 @@ from ..mesh import CollisionMesh
 from ..run.launch import made_once
 from ..run.settings import NO_GRADIENTS
 
-_FEW_BUNDLES = 8
-"""Number of bundles up to which all of them are traversed: their boxes would take longer than they save."""
+FEW_NODES = 8
+"""Nodes of a level above the clusters up to which all are traversed: their boxes would take longer than they save."""
 
 
 @wp.struct
@@ -58,14 +60,14 @@ class FaceHierarchy:
         face_count: Number of faces; greater cells are edges.
         point_start: First cell that is a point.
         order: Cell at each place, -1 for none.
-        faces: Vertices of the face at each place.
+        faces: Vertices of the cell at each place, and what it represents, see :mod:`warp_bsc.kernels.pipeline.corners`.
         face_edges: Edges of the face at each place.
-        owned: The elements whose representative the face at each place is.
         edges: Vertices of each edge.
-        corners: Corners of the face at each place, see :mod:`warp_bsc.kernels.pipeline.corners`.
+        corners: Rows of vertices, or with a padding those of the cell at each place.
         places: Level of the faces; where a position is not finite, boxes cover the others.
         clusters: Level above.
-        bundles: Highest level; without arrays in a small mesh, where all are traversed.
+        bundles: Level above the clusters; without arrays in a small mesh, where all are traversed.
+        groups: Level above the bundles; without arrays likewise.
     """
 
     only_free: wp.bool
@@ -76,50 +78,71 @@ class FaceHierarchy:
     order: wp.array[int]
     faces: wp.array2d[int]
     face_edges: wp.array2d[int]
-    owned: wp.array[int]
     edges: wp.array2d[int]
     corners: wp.array2d[wp.float32]
     places: HierarchyLevel
     clusters: HierarchyLevel
     bundles: HierarchyLevel
+    groups: HierarchyLevel
 
 
-@wp.func
-def empty_box() -> BoxRows:
-    """Returns a box that overlaps none."""
-    low = wp.vec3(wp.inf, wp.inf, wp.inf)
-    return wp.matrix_from_rows(low, -low, low, -low)
+@made_once
+def round_kernel(dtype: type) -> wp.Kernel:
+    """Returns the kernel that counts the vertices that are not finite, and writes the rows of all if there are any."""
+
+    @wp.kernel(**NO_GRADIENTS)
+    def round_positions(
+        # in
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        checked: wp.array[int],
+        # out
+        rows: wp.array2d[wp.float32],
+        not_finite: wp.array[wp.int64],
+    ):
+        vertex = wp.tid()
+        start = rounded(x0[vertex])
+        end = rounded(x1[vertex])
+        if not (wp.isfinite(x0[vertex]) and wp.isfinite(x1[vertex])):
+            start = wp.vec3(wp.nan, wp.nan, wp.nan)
+            counted = int(1)
+            if checked:
+                counted = checked[vertex]
+            if not_finite and counted != 0:
+                raise_count(not_finite, 0, 1)
+        if rows:
+            write_vertex(rows, vertex, start, end)
+
+    return round_positions
 
 
 @made_once
 def fit_kernel(dtype: type, padded: bool) -> wp.Kernel:
-    """Returns the kernel that writes the corners of moving faces, and the boxes of faces and clusters.
-
-    Its threads are the places of faces, then the vertices, of which it counts those that are not finite.
+    """Returns the kernel that writes the boxes of faces and clusters, and with a padding the rows of the cells.
 
     Args:
-        dtype: Type of the positions.
+        dtype: Type of the positions, which only boxes with a padding are computed from; others from rows of vertices.
         padded: Whether boxes have a padding.
     """
-    corners_type = PaddedCorners if padded else Corners
 
     @wp.func
-    def padding_of(padding: wp.array[wp.float64], a: int, b: int, c: int) -> wp.float64:
-        """Returns the largest padding of three vertices; without paddings the array is not read."""
-        if wp.static(padded):
-            return wp.max(wp.max(padding[a], padding[b]), padding[c])
-        return wp.float64(0.0)
-
-    @wp.func
-    def write_row(mesh: FaceHierarchy, i: int, label: wp.vec4i, corners: corners_type):
-        if wp.static(padded):
-            write_padded_corners(mesh.corners, i, label, corners)
+    def corners_of(
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        padding: wp.array[wp.float64],
+        mesh: FaceHierarchy,
+        i: int,
+        cell: wp.vec4i,
+    ):
+        if wp.static(not padded):
+            return read_corners(mesh.corners, cell)
         else:
-            write_corners(mesh.corners, i, label, corners)
-
-    @wp.func
-    def is_finite(x0: wp.array[dtype], x1: wp.array[dtype], vertex: int) -> bool:
-        return wp.isfinite(x0[vertex]) and wp.isfinite(x1[vertex])
+            pad = wp.max(wp.max(padding[cell[0]], padding[cell[1]]), padding[cell[2]])
+            corners = PaddedCorners()
+            for j in range(3):
+                corners = with_padded_corner(corners, j, x0[cell[j]], x1[cell[j]], pad)
+            write_padded_corners(mesh.corners, i, corners)
+            return corners
 
     @wp.kernel(**NO_GRADIENTS)
     def fit(
@@ -127,54 +150,23 @@ def fit_kernel(dtype: type, padded: bool) -> wp.Kernel:
         x0: wp.array[dtype],
         x1: wp.array[dtype],
         changed: wp.array[int],
-        checked: wp.array[int],
         padding: wp.array[wp.float64],
         swept: bool,
         # in and out
         mesh: FaceHierarchy,
-        # out
-        not_finite: wp.array[wp.int64],
     ):
         i = wp.tid()
-        places = mesh.order.shape[0]
-        if i >= places:
-            vertex = i - places
-            if not is_finite(x0, x1, vertex):
-                counted = int(1)
-                if checked:
-                    counted = checked[vertex]
-                if counted != 0:
-                    raise_count(not_finite, 0, 1)
-            return
-        box = empty_box()  # the same branch for all threads of a warp from here on
+        box = empty_box()
         has_changed = int(0)
         if mesh.order[i] >= 0:
-            a = mesh.faces[i, 0]
-            b = mesh.faces[i, 1]
-            c = mesh.faces[i, 2]
-            pad = padding_of(padding, a, b, c)
-            corners = with_corner(corners_type(), 0, x0[a], x1[a], pad)
-            corners = with_corner(corners, 1, x0[b], x1[b], pad)
-            corners = with_corner(corners, 2, x0[c], x1[c], pad)
-            a_finite = is_finite(x0, x1, a)
-            b_finite = is_finite(x0, x1, b)
-            c_finite = is_finite(x0, x1, c)
-            owned = mesh.owned[i]
-            if a_finite and b_finite and c_finite:
-                box = face_box(corners, swept)
-                owned = owned | wp.where(mesh.order[i] < mesh.face_count, IS_FACE, 0)
-            else:  # the place covers what it represents and is finite
-                owned = finite_elements(owned, a_finite, b_finite, c_finite)
-                if a_finite:
-                    box = union_of_boxes(box, vertex_box(corners, 0, swept))
-                if b_finite:
-                    box = union_of_boxes(box, vertex_box(corners, 1, swept))
-                if c_finite:
-                    box = union_of_boxes(box, vertex_box(corners, 2, swept))
-            write_row(mesh, i, wp.vec4i(a, b, c, owned), corners)
+            cell = read_cell(mesh.faces, i)
+            corners = corners_of(x0, x1, padding, mesh, i, cell)
+            for j in range(3):
+                if corner_is_finite(corners, j):  # the place covers what is finite
+                    box = union_of_boxes(box, vertex_box(corners, j, swept))
             has_changed = 1
             if changed:
-                has_changed = changed[a] | changed[b] | changed[c]
+                has_changed = changed[cell[0]] | changed[cell[1]] | changed[cell[2]]
             if mesh.only_free and mesh.order[i] < mesh.face_count:
                 has_changed = 0
         write_box(box, mesh.places.boxes, i)
@@ -185,28 +177,36 @@ def fit_kernel(dtype: type, padded: bool) -> wp.Kernel:
 
 
 @wp.kernel(**NO_GRADIENTS)
-def box_bundles(
+def box_parents(
     # in
-    clusters: HierarchyLevel,
+    children: HierarchyLevel,
     # out
-    bundles: HierarchyLevel,
+    parents: HierarchyLevel,
 ):
-    """Boxes the bundles."""
+    """Boxes bundles or groups."""
     i = wp.tid()
     box = empty_box()
     has_changed = int(0)
-    if i < clusters.boxes.shape[0]:
-        box = read_box(clusters.boxes, i)
-        has_changed = clusters.changed[i]
-    fit_parent(i, box, has_changed, bundles)
+    if i < children.boxes.shape[0]:
+        box = read_box(children.boxes, i)
+        has_changed = children.changed[i]
+    fit_parent(i, box, has_changed, parents)
+
+
+@wp.func
+def _nodes_to_visit(clusters: HierarchyLevel, cluster: int, box: BoxRows, level: HierarchyLevel, first: int, end: int):
+    """Returns which of 32 nodes of a level, from the first on, to visit for a cluster, as bits; all without boxes."""
+    if level.boxes:
+        return unseparated_children(clusters, cluster, box, level, first)
+    return ~bits_from(end - first)
 
 
 @made_once
 def traversal_kernel(visit: Callable, arguments_type: type) -> wp.Kernel:
     """Returns a kernel that visits the pairs of faces whose boxes no axis separates at both ends, each pair once.
 
-    Its parameters are a :class:`FaceHierarchy`, the warps of a cluster and the arguments; launch it with
-    :meth:`BroadPhaseHierarchy.traverse`. The boxes must have been fitted.
+    Its parameters are a :class:`FaceHierarchy`, the first cluster, the warps of a cluster and the arguments; launch it
+    with :meth:`BroadPhaseHierarchy.traverse`. The boxes must have been fitted.
 
     Args:
         visit: Device function, ``visit(place: int, first: int, found: wp.uint32, arguments)``: the face at ``place``
@@ -217,38 +217,43 @@ def traversal_kernel(visit: Callable, arguments_type: type) -> wp.Kernel:
     """
 
     @wp.kernel(**NO_GRADIENTS)
-    def traverse(mesh: FaceHierarchy, warps_of_cluster: int, arguments: arguments_type):
+    def traverse(mesh: FaceHierarchy, first_cluster: int, warps_of_cluster: int, arguments: arguments_type):
         i = wp.tid()
-        cluster = i / (WIDTH * warps_of_cluster)
+        cluster = first_cluster + i / (WIDTH * warps_of_cluster)
         part = (i / WIDTH) % warps_of_cluster
         place = cluster * WIDTH + i % WIDTH
         box = read_box(mesh.places.boxes, place)
         cluster_box = read_box(mesh.clusters.boxes, cluster)
         own_bundle = cluster / WIDTH
+        own_group = own_bundle / WIDTH
         turn = int(0)
-        count = (mesh.clusters.boxes.shape[0] - 1) / WIDTH + 1
-        for first_bundle in range(own_bundle, count, WIDTH):
-            bundles = wp.uint32(0)
-            if mesh.bundles.boxes:
-                bundles = unseparated_children(mesh.clusters, cluster, cluster_box, mesh.bundles, first_bundle)
-            else:
-                bundles = ~bits_from(count - first_bundle)
-            while bundles != wp.uint32(0):
-                bundle = first_bundle + lowest_set_bit(bundles)
-                bundles = bundles & (bundles - wp.uint32(1))
-                clusters = unseparated_children(mesh.clusters, cluster, cluster_box, mesh.clusters, bundle * WIDTH)
-                if bundle == own_bundle:
-                    clusters = clusters & bits_from(cluster % WIDTH)
-                while clusters != wp.uint32(0):
-                    first = (bundle * WIDTH + lowest_set_bit(clusters)) * WIDTH
-                    clusters = clusters & (clusters - wp.uint32(1))
-                    if turn % warps_of_cluster == part:
-                        faces = unseparated_children(mesh.clusters, cluster, cluster_box, mesh.places, first)
-                        if faces != wp.uint32(0):
-                            changed = changed_children(mesh.places, first)
-                            found = unseparated_faces(mesh.places, place, box, first, faces, changed)
-                            visit(place, first, found, arguments)
-                    turn += 1
+        bundle_end = (mesh.clusters.boxes.shape[0] - 1) / WIDTH + 1
+        group_end = (bundle_end - 1) / WIDTH + 1
+        for first_group in range(own_group, group_end, WIDTH):
+            groups = _nodes_to_visit(mesh.clusters, cluster, cluster_box, mesh.groups, first_group, group_end)
+            while groups != wp.uint32(0):
+                group = first_group + lowest_set_bit(groups)
+                groups = groups & (groups - wp.uint32(1))
+                first_bundle = group * WIDTH
+                bundles = _nodes_to_visit(mesh.clusters, cluster, cluster_box, mesh.bundles, first_bundle, bundle_end)
+                if group == own_group:
+                    bundles = bundles & bits_from(own_bundle % WIDTH)
+                while bundles != wp.uint32(0):
+                    bundle = first_bundle + lowest_set_bit(bundles)
+                    bundles = bundles & (bundles - wp.uint32(1))
+                    clusters = unseparated_children(mesh.clusters, cluster, cluster_box, mesh.clusters, bundle * WIDTH)
+                    if bundle == own_bundle:
+                        clusters = clusters & bits_from(cluster % WIDTH)
+                    while clusters != wp.uint32(0):
+                        first = (bundle * WIDTH + lowest_set_bit(clusters)) * WIDTH
+                        clusters = clusters & (clusters - wp.uint32(1))
+                        if turn % warps_of_cluster == part:
+                            faces = unseparated_children(mesh.clusters, cluster, cluster_box, mesh.places, first)
+                            if faces != wp.uint32(0):
+                                changed = changed_children(mesh.places, first)
+                                found = unseparated_faces(mesh.places, place, box, first, faces, changed)
+                                visit(place, first, found, arguments)
+                        turn += 1
 
     return traverse
 
@@ -271,31 +276,34 @@ def _parents(worlds: np.ndarray | None) -> np.ndarray | None:
     return np.stack([first.min(axis=1), last.max(axis=1)])
 
 
-def bundle_count(places: int) -> int:
-    """Returns the number of bundles that have boxes."""
-    bundles = -(-places // (WIDTH * WIDTH))
-    return bundles if bundles > _FEW_BUNDLES else 0
+def parent_count(children: int) -> int:
+    """Returns the number of parents of some clusters or bundles, 0 if they have no boxes."""
+    parents = -(-children // WIDTH)
+    return parents if parents > FEW_NODES else 0
 
 
 def make_hierarchy(mesh: CollisionMesh, *, padded: bool) -> FaceHierarchy:
     """Allocates the hierarchy of a mesh on its device, for boxes with a padding or without."""
-    device, order, places = mesh.device, mesh.face_order, mesh.device_places
+    device, order = mesh.device, mesh.face_order
     hierarchy = FaceHierarchy()
     hierarchy.only_free, hierarchy.pair_filter = mesh.only_free, mesh.pair_filter
     hierarchy.face_count, hierarchy.point_start = len(mesh.faces), len(mesh.faces) + len(mesh.free_edges)
-    hierarchy.order, hierarchy.faces, hierarchy.face_edges = places.order, places.faces, places.face_edges
-    hierarchy.owned, hierarchy.edges = places.owned, mesh.device_edges
-    hierarchy.corners = wp.empty((len(order), PADDED_ROW if padded else ROW), dtype=wp.float32, device=device)
+    hierarchy.order, hierarchy.faces, hierarchy.face_edges = mesh.device_places
+    hierarchy.edges = mesh.device_edges
+    rows = (len(order), PADDED_ROW) if padded else (mesh.vertex_count, ROW)
+    hierarchy.corners = wp.empty(rows, dtype=wp.float32, device=device)
     worlds = None
     if mesh.world is not None and len(order):
         world = mesh.world[mesh.cells[:, 0]][order]
         # empty places have the worlds of the faces before, which keeps those of nodes
         filled = np.maximum.accumulate(np.where(order >= 0, np.arange(len(order)), 0))
         worlds = np.stack([world[filled], world[filled]])
-    clusters, bundles = len(order) // WIDTH, bundle_count(len(order))
-    hierarchy.places = _level(len(order), worlds, device)
-    worlds = _parents(worlds)
-    hierarchy.clusters = _level(clusters, worlds, device)
-    if bundles:
-        hierarchy.bundles = _level(bundles, _parents(worlds), device)
+    count = len(order)
+    hierarchy.places = _level(count, worlds, device)
+    count, worlds = count // WIDTH, _parents(worlds)
+    hierarchy.clusters = _level(count, worlds, device)
+    for name in ("bundles", "groups"):
+        count, worlds = parent_count(count), _parents(worlds)
+        if count:
+            setattr(hierarchy, name, _level(count, worlds, device))
     return hierarchy

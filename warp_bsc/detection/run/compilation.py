@@ -22,8 +22,8 @@ def reported_to(listener: Callable[[], None]) -> Iterator[None]:
 
 
 def duration(is_cpu: bool) -> str:
-    """Returns about how long the compilation of all kernels of a step or of a replay takes, in words."""
-    return "about half a minute of processor time" if is_cpu else "up to a few minutes"
+    """Returns about how long the compilation of all kernels of a replay or of a solver takes, in words."""
+    return "half a minute of processor time, two minutes for a solver" if is_cpu else "up to a few minutes"
 
 
 @functools.cache
