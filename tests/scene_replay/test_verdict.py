@@ -82,6 +82,15 @@ def test_what_is_there_from_the_start(tmp_path, capsys):
     )
 
 
+def test_what_no_sample_shows(tmp_path, capsys):
+    """The triangle is above the floor at time 0, and below it at time 1."""
+    stage = floor_stage(tmp_path)
+    add_mesh(stage, "/World/Falling", {0: moved(FALLING, (0, 0, 1)), 1: moved(FALLING, (0, 0, -2))})
+    said = "No mesh intersects at a sample: frames there show nothing, but motion blur and frames in between may."
+    assert verdict(capsys, stage).endswith(said)
+    assert said not in verdict(capsys, stage, "--no-intersections")
+
+
 def test_a_clean_scene_names_what_was_checked(tmp_path, capsys):
     stage = new_stage(tmp_path / "soft.usda")
     add_tets(stage, CORNERS, [(0, 1, 2, 3)])

@@ -2,8 +2,8 @@
 
 ``python tests/support/pile_energy.py --sheets 50`` prints energies every fifteen steps of 1/600 s, how much they have
 gained at most since they were least, the median time of a step, and the crossings at the end; ``--cells 69`` makes
-sheets of 9,522 triangles. ``--solver`` is ``stage``, ``SolverCCD(SolverVBD)``; ``implicit``, ``SolverImplicit``; ``vbd``;
-or ``vbd-self-contact``, which pushes sheets apart from 0.5 mm on. On CUDA, steps run in a graph.
+sheets of 9,522 triangles. ``--solver`` is ``stage``, ``SolverCCD(SolverVBD)``; ``implicit``, ``SolverImplicit``; or
+``vbd``, or ``vbd-self-contact``, which pushes sheets apart from 0.5 mm on. On CUDA, steps run in a graph.
 """
 
 import argparse

@@ -64,6 +64,15 @@ def test_arcs_are_the_paths_of_the_stage(stage, seed):
     assert largest_error(stage, rng.uniform(0, 1, 20)) < 2e-6
 
 
+@pytest.mark.parametrize("start", np.linspace(-6.9, -0.1, 18))
+def test_orientations_that_go_past_none_turn(stage, start):
+    """OpenUSD takes an angle from the cosine of its half, which near none is coarse in single precision."""
+    mesh = add_mesh(stage, "/World/Mesh", FALLING)
+    half = np.radians([start, start + 7.0]) / 2.0
+    turning(mesh.AddOrientOp(), *(Gf.Quatf(float(np.cos(h)), 0.0, 0.0, float(np.sin(h))) for h in half))
+    assert largest_error(stage, np.linspace(0.0, 1.0, 41)) < 7e-4  # a straight path is 2e-3 off
+
+
 @pytest.mark.parametrize("angles", [(0, 360), (-180, 180), (10, 730), (0, -36000), (0, 180 * 1001), (0, 1)])
 def test_any_number_of_turns(stage, angles):
     mesh = add_mesh(stage, "/World/Mesh", FALLING)

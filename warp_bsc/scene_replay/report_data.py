@@ -68,8 +68,8 @@ def pairs_of_meshes(summary: Summary) -> list[PairFindings]:
     pairs = [PairFindings(key, *own, key in initial, summary.depths.get(key)) for key, own in spans.items()]
 
     def rank(pair: PairFindings) -> tuple:
-        is_only_near = not pair.collisions and not pair.intersections
-        return is_only_near, pair.is_initial, -(pair.depth or (0.0,))[0], -pair.hits, pair.meshes
+        depth, is_near = (pair.depth or (0.0,))[0], not (pair.collisions or pair.intersections)
+        return is_near, pair.is_initial, -depth, -pair.hits, pair.meshes
 
     return sorted(pairs, key=rank)
 
@@ -92,22 +92,22 @@ def verdict(summary: Summary) -> str:
     if later < len(pairs):
         parts[0] += f", {later:,} of them only after the first time" if later else ", at the first time already"
     parts += [f"tetrahedra of {inverting:,} {_plural('mesh', inverting, 'es')} invert"] * bool(inverting)
-    is_broken = bool(parts)
     parts += [f"{same:,} meshes are duplicates"] * bool(same)
     if near := len(summary.nearest):
         parts.append(f"within {summary.clearance:g} of each other: {near:,} {_plural('pair', near)} of meshes")
     if not parts:
         return ""  # nothing was checked, or not all of it
-    text = f"{'Broken' if is_broken else 'Not broken, but'}: {'; '.join(parts)}."
+    text = f"{'Broken' if pairs or inverting else 'Not broken, but'}: {'; '.join(parts)}."
     if pairs:
         (first, second), worst = pairs[0].meshes, pairs[0]
         depth, spans = worst.depth[0] if worst.depth else 0.0, [*worst.collisions, *worst.intersections]
-        hits = f"{worst.hits:,} {_plural('collision', worst.hits)}"
         since, until = min(span.since for span in spans), max(span.until for span in spans)
-        deep, when = f"{length(summary.scene, depth)} deep" if depth else hits, f"time {since:g}"
-        when += f" to {until:g}" * (until > since)
+        deep = f"{length(summary.scene, depth)} deep" if depth else f"{worst.hits:,} {_plural('collision', worst.hits)}"
+        when = f"time {since:g}" + f" to {until:g}" * (until > since)
         of_these = " of these" * (0 < later < len(pairs))
         text += f" The worst{of_these}: {first} with {'itself' if first == second else second}, {deep}, {when}."
+    if pairs and summary.intersections and not any(pair.intersections for pair in pairs):
+        text += " No mesh intersects at a sample: frames there show nothing, but motion blur and frames in between may."
     return text
 
 

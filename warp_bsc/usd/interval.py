@@ -8,8 +8,8 @@ import numpy as np
 from .segment import Segment
 from .turns import Turn
 
-_LEFT_OUT, _MESSAGE = "left out: {}".format, "message of OpenUSD: {}".format
-_NAMED = 5  # largest number of parts left out, and of messages of OpenUSD, in the warnings
+_LEFT_OUT = "left out: {}".format
+_NAMED = 5  # largest number of parts left out, and of messages, in the warnings
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class ReadingNotes:
 
     Attributes:
         left_out: The meshes left out of this interval or later ones.
-        messages: Messages of OpenUSD that are new.
+        messages: Messages that are new, as of :class:`ReadingRecord`.
         jumps: Names of the meshes that do not start where the previous interval ended.
     """
 
@@ -49,7 +49,7 @@ class ReadingRecord:
 
     Attributes:
         parts: The meshes left out after the file was opened.
-        messages: Messages of OpenUSD.
+        messages: Sentences with messages of OpenUSD, and on the first mesh that turns off straight paths and arcs.
         welded: Largest number of welded vertices of a segment.
     """
 
@@ -82,7 +82,7 @@ class ReadingRecord:
         sentences = [*map(_LEFT_OUT, reasons[:_NAMED])]
         if len(reasons) > _NAMED:
             sentences.append(f"left out: {len(reasons) - _NAMED} more, {len(reasons)} in all")
-        sentences += map(_MESSAGE, self.messages[:_NAMED])
+        sentences += self.messages[:_NAMED]
         sentences += missing[:_NAMED]
         if len(missing) > _NAMED:
             sentences.append(f"missing: {len(missing) - _NAMED} more, {len(missing)} in all")
@@ -144,7 +144,7 @@ class Interval:
         """Sentences on the parts left out, messages of OpenUSD and jumps that reading this interval revealed."""
         return (
             *(_LEFT_OUT(part.reason) for part in self.notes.left_out),
-            *map(_MESSAGE, self.notes.messages),
+            *self.notes.messages,
             *(jump_warning(name, [self.start]) for name in self.jumps),
         )
 

@@ -185,7 +185,10 @@ class Scene:
             texts = {"Comment": "comment", "Documentation": "documentation"}
             self.comments = [(title, text) for title, key in texts.items() if (text := self.stage.GetMetadata(key))]
             self._usd_meshes, self._warnings = find_meshes(self.stage, path, self.selection, self._left_out)
-            self._check_meshes(bool(options.selection))
+            if not self._usd_meshes and not self.left_out:
+                none = ", or none is selected" * bool(options.selection)
+                reason = "".join(f"; {warning}" for warning in self._warnings[:1])
+                raise EmptySceneError(f"{path}: no visible mesh in the scene{none}{reason}")
             self._by_name = {mesh.name: mesh for mesh in self._usd_meshes}
             self.dtype = np.dtype(np.float32 if all(mesh.is_placed for mesh in self._usd_meshes) else np.float64)
             frames = options.frames or FrameRange()
@@ -348,7 +351,9 @@ class Scene:
         segment, x0, x1, tet_positions, jumps = self._read_positions(index)
         start, end = self.times[index : index + 2]
         with self._collecting(self._record.messages, self.path):
-            turns = segment.turns(start, end) if self.turning and end > start else {}
+            turns, bent = segment.turns(start, end) if self.turning and end > start else ({}, [])
+        notes = [f"subdivide: {name} turns, not at one rate about one axis: checked on straight paths" for name in bent]
+        self._record.messages += [note for note in notes[:1] if note not in self._record.messages]
         is_joined = not segment.may_jump and bool(self._span and index + 1 < self._span[1])
         return Interval(index, start, end, segment, x0, x1, is_joined, self.take_notes(jumps), tet_positions, turns)
 
@@ -382,13 +387,6 @@ class Scene:
     def _contents(self) -> tuple:
         """Returns facts of the scene that must be the same in another process."""
         return self.times, [mesh.name for mesh in self._usd_meshes], len(self.left_out)
-
-    def _check_meshes(self, is_selection):
-        """Raises an EmptySceneError if there are no meshes, and none is left out."""
-        if not self._usd_meshes and not self.left_out:
-            none_selected = ", or none is selected" * is_selection
-            reason = "".join(f"; {warning}" for warning in self._warnings[:1])
-            raise EmptySceneError(f"{self.path}: no visible mesh in the scene{none_selected}{reason}")
 
     def _jumps_at_end(self) -> bool:
         """Returns whether a mesh jumps at the last time, or cannot be read at it."""

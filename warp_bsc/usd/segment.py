@@ -155,8 +155,8 @@ class Segment:
         reader.read(positions, time, before)
         return positions
 
-    def turns(self, start: float, end: float) -> dict[int, Turn]:
-        """Returns the turns from one time to the next of the meshes that only their transforms move, by their numbers.
+    def turns(self, start: float, end: float) -> tuple[dict[int, Turn], list[str]]:
+        """Returns the turns of meshes that only their transforms move, by their numbers; and names of those that bend.
 
         Args:
             start: Time code of the first time.
@@ -167,7 +167,8 @@ class Segment:
             return self._usd_meshes[number].read_transform(start + share * (end - start), before=share == 1.0)
 
         turning = [mesh.turns and mesh.transforms.may_turn and not mesh.deforms for mesh in self._usd_meshes]
-        return find_turns(transform, np.flatnonzero(turning).tolist())
+        turns, bent = find_turns(transform, np.flatnonzero(turning).tolist())
+        return turns, [self.meshes[number].path for number in bent]
 
     @property
     def has_strands(self) -> bool:

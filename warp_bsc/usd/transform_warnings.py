@@ -88,7 +88,9 @@ def _turn_warning(op: UsdGeom.XformOp, meshes: list[UsdMesh], times: list[float]
         (large,) = np.nonzero((degrees >= _LARGE_TURN * (1.0 - _ROUNDING)) & np.isfinite(degrees))
     if not any(mesh.deforms for mesh in meshes):
         # what does not vary below a turn makes no difference to it
-        alike = {mesh.name if mesh.instance else _varying(mesh): mesh for mesh in meshes}
+        ops = {mesh: mesh.transforms.ops(mesh.instance) for mesh in meshes}
+        varying = {mesh: tuple(op.GetAttr().GetPath() for op in ops[mesh] if op.MightBeTimeVarying()) for mesh in ops}
+        alike = {mesh.name if mesh.instance else varying[mesh]: mesh for mesh in meshes}
         on_arcs = [_on_arcs(mesh, large.tolist(), times) for mesh in alike.values()]
         large = large[[any(index not in turns for turns in on_arcs) for index in large.tolist()]]
     if not len(large):
@@ -103,18 +105,13 @@ def _turn_warning(op: UsdGeom.XformOp, meshes: list[UsdMesh], times: list[float]
     ]
 
 
-def _varying(mesh: UsdMesh) -> tuple[Sdf.Path, ...]:
-    """Returns the attributes of the operations of a mesh's transform that vary."""
-    return tuple(op.GetAttr().GetPath() for op in mesh.transforms.ops(mesh.instance) if op.MightBeTimeVarying())
-
-
 def _on_arcs(mesh: UsdMesh, intervals: list[int], times: list[float]) -> dict[int, Turn]:
     """Returns the turns of a mesh in intervals in which it turns about one axis at a constant rate."""
 
     def transform(index: int, share: float) -> np.ndarray | None:
         return mesh.read_transform(times[index] + share * (times[index + 1] - times[index]), before=share == 1.0)
 
-    return find_turns(transform, intervals)
+    return find_turns(transform, intervals)[0]
 
 
 def _first_zero(op: UsdGeom.XformOp, times: list[float]) -> float | None:

@@ -18,8 +18,9 @@ _COUNTED = [2.0**-10, 2.0**-5, 1.0]
 known; each angle tells the next up to rounding, and so how many whole turns that has."""
 _OTHERS = [0.146, 0.618, 0.854]
 """Where else the stage's transforms must be those of the turn; so many turns that they would be miscounted are not."""
-_FIT = 1e-5
-"""Largest difference from the turn, as a share of the distance from its axis: USD interpolates in single precision."""
+_FIT, _ROUNDED, _NEARER = 1e-5, 7e-4, 0.2
+"""Largest difference from the turn, as a share of the distance from its axis: USD interpolates in single precision. It
+takes angles of orientations from cosines, which near none rounds so much; then straight paths must be that far off."""
 _SINGLE = 1e-6
 """Rounding of coordinates in single precision, and of transforms that are straight."""
 _SMALL = 1e-9
@@ -51,8 +52,10 @@ class Turn:
 
 
 @np.errstate(over="ignore", invalid="ignore")
-def find_turns(transforms: Callable[[int, float], np.ndarray | None], numbers: list[int]) -> dict[int, Turn]:
-    """Returns the turns of those meshes that turn at a constant rate about one axis, by their numbers.
+def find_turns(
+    transforms: Callable[[int, float], np.ndarray | None], numbers: list[int]
+) -> tuple[dict[int, Turn], list[int]]:
+    """Returns the turns of meshes at a constant rate about one axis, by their numbers; and which bend without one.
 
     Args:
         transforms: Returns the matrix that transforms points of a mesh, as rows, to world space, shape [4, 4]; None or
@@ -72,12 +75,13 @@ def find_turns(transforms: Callable[[int, float], np.ndarray | None], numbers: l
     bent = bent & (np.linalg.cond(invertible) < _LARGEST_CONDITION)
     some = [number for number, is_bent in zip(numbers, bent.tolist(), strict=True) if is_bent]
     if not some:
-        return {}
+        return {}, []
     shares = [0.0, 1.0, BETWEEN, *_COUNTED[:-1], *_OTHERS]
     matrices = [end[bent] for end in ends] + [read(share, some) for share in shares[len(ends) :]]
     centres, vectors, fit = _fit_turns(np.array(shares), np.stack(matrices, axis=1))
     rows = zip(some, centres, vectors, fit.tolist(), strict=True)
-    return {number: Turn(centre, vector) for number, centre, vector, fits in rows if fits}
+    turns = {number: Turn(centre, vector) for number, centre, vector, fits in rows if fits}
+    return turns, [number for number in some if number not in turns]
 
 
 def are_bent(start: np.ndarray, end: np.ndarray, between: np.ndarray) -> np.ndarray:
@@ -103,11 +107,13 @@ def _fit_turns(shares: np.ndarray, matrices: np.ndarray) -> tuple[np.ndarray, np
     vectors = _rotation_vectors(shares, rotations)
     modelled = _rotations(shares[:, None] * vectors[:, None])
     angles = np.linalg.norm(vectors, axis=1)
-    relative = _FIT * (1.0 + 0.01 * angles)  # angles in degrees are rounded in proportion
+    share = shares[:, None]
+    bends = modelled - share[..., None] * modelled[:, 1:2] - (1.0 - share[..., None]) * np.eye(3)
+    off = np.minimum(_ROUNDED, _NEARER * np.abs(bends).max(axis=(1, 2, 3)))
+    relative = np.maximum(_FIT * (1.0 + 0.01 * angles), off)  # angles in degrees are rounded in proportion
     fit = finite & (angles > 0.0) & (np.abs(rotations - modelled).max(axis=(1, 2, 3)) <= relative)
     # origin(t) = (1 - t) origin(0) + t origin(1) + bend(t) (origin(0) - centre)
-    origins, share = matrices[:, :, 3, :3], shares[:, None]
-    bends = modelled - share[..., None] * modelled[:, 1:2] - (1.0 - share[..., None]) * np.eye(3)
+    origins = matrices[:, :, 3, :3]
     deviations = origins - (1.0 - share) * origins[:, :1] - share * origins[:, 1:2]
     n = len(matrices)
     factors, deviations = bends.reshape(n, -1, 3), deviations.reshape(n, -1, 1)

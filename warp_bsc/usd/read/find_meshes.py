@@ -4,7 +4,7 @@ import os
 from collections import Counter
 from collections.abc import Mapping
 
-from pxr import Usd
+from pxr import Usd, UsdSkel
 
 from ..selection import Selection
 from .mesh_prims import MeshPrimFinder
@@ -62,7 +62,7 @@ def find_meshes(
             continue
         else:
             meshes.append(mesh)
-        if found.has_unevaluated_binding:
+        if found.binding is None and UsdSkel.BindingAPI(found.prim).GetInheritedSkeleton():
             warnings.append(f"{mesh.path} is bound to a skeleton in a way that USD does not evaluate")
     if invisible:
         warnings.append(f"invisible prims are not checked: {len(invisible)}, the first is {invisible[0]}")

@@ -41,11 +41,6 @@ class MeshPrim:
         """Purpose of the prim."""
         return str(UsdGeom.Imageable(self.prim).ComputePurpose())
 
-    @property
-    def has_unevaluated_binding(self) -> bool:
-        """Whether the prim is bound to a skeleton in a way that USD does not evaluate."""
-        return self.binding is None and bool(UsdSkel.BindingAPI(self.prim).GetInheritedSkeleton())
-
 
 class MeshPrimFinder:
     """Walks a stage, and the prototypes of point instancers once for each instance.

@@ -123,7 +123,7 @@ def collecting(messages: list[str], file: str | os.PathLike) -> Iterator[None]:
         with reading(str(file), errors=_DAMAGE):
             yield
     finally:
-        texts = map(_commentary, delegate.TakeUncoalescedDiagnostics())
+        texts = (f"message of OpenUSD: {_commentary(text)}" for text in delegate.TakeUncoalescedDiagnostics())
         messages += dict.fromkeys(text for text in texts if text not in messages)
 
 
