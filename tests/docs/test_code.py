@@ -70,7 +70,7 @@ def test_from_ipctk(tmp_path, capsys):
     assert lines[:2] == ["6", "3 False True"] and lines[2].startswith("0.249999")
     assert lines[3:5] == ["True", "False True"]
     assert lines[5:7] == ["[[3, 4], [3, 5]]", "[[3, 0], [4, 0], [5, 0]]"]
-    assert lines[8:] == ["False", "[[3, 0]] 1.0", "1.0", "[1.]", "0"]
+    assert lines[8:] == ["False", "[[3, 0]] 1.0", "1.0", "[1.]", "[ 1.   -0.5  -0.25 -0.25]", "0"]
     shown = set(re.findall(r"# ([^,;\n]*?)(?:[,;]|\.\.\.|$)", "\n".join(blocks_of("from_ipctk.md")[0]), re.MULTILINE))
     assert shown >= {"6", "3 False True", "True", "False True", "False", "1.0", "[1.]", "0"}
     assert names["r"].hit.all() and names["group"].tolist() == [2] * 3 + [4] * 3
