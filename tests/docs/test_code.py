@@ -92,6 +92,8 @@ def test_kernels(tmp_path, capsys):
     assert names["count"].numpy().tolist() == [1] and output.startswith("[1]\n")
     assert 0.5 - 2.0**-20 <= names["first"].numpy()[0] <= 0.5 and (names["first"].numpy()[1:] == 2.0).all()
     np.testing.assert_allclose(names["x1"].grad.numpy()[0], [0.0, 0.0, 0.25], atol=1e-6)
+    moved = names["x"].numpy()
+    assert 0.0 < moved[0, 2] < 2e-6 and (moved[1:] == names["x0"][1:]).all()
 
 
 @pytest.mark.parametrize("page", [pytest.param(page, marks=LONG * ("4_" in page or "5_" in page)) for page in TUTORIAL])
