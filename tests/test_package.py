@@ -4,6 +4,7 @@ import ast
 import functools
 import importlib.util
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -219,6 +220,18 @@ def test_packages_import_only_what_the_layout_allows():
         if package != module[1] and module[1] not in PACKAGES.get(package, ())
     ]
     assert not wrong, "\n".join(wrong)
+
+
+def test_the_table_of_folders_says_who_imports_whom():
+    rows = re.findall(
+        r"^\| `warp_bsc/(\w+)/` \|.*\| (.*) \|$",
+        (ROOT / ".github" / "CONTRIBUTING.md").read_text(encoding="utf-8"),
+        re.MULTILINE,
+    )
+    assert len(rows) > 8
+    for package, allowed in rows:
+        expected = {name for name in PACKAGES[package] if not name.startswith("_")}
+        assert set(re.findall(r"`(\w+)`", allowed)) == expected, package
 
 
 def circles(importers):
