@@ -101,7 +101,7 @@ class StepWarnings:
         filtering = ""
         if len(holding := report.find_shapes_at(particles)):
             filtering = (
-                f"To let particles pass through {first_of([shape_name(model, shape) for shape in holding])}: "
+                f"Leave more room, or let them through {first_of([shape_name(model, shape) for shape in holding])}: "
                 f"collision_filter=CollisionFilter(shape_mask=mask), with mask = np.full({model.shape_count}, -1) and "
                 f"mask[{holding.tolist()}] = 0. "
             )
