@@ -139,8 +139,11 @@ def too_fast(mesh):
 @pytest.mark.parametrize("move", [matrices, two_angles, two_axes, growing, sliding, flat, too_fast])
 def test_what_is_no_turn_about_one_axis_has_none(stage, move):
     move(add_mesh(stage, "/World/Mesh", FALLING))
-    (interval,) = bsc.Scene(save(stage))
+    scene = bsc.Scene(save(stage))
+    (interval,) = scene
     assert interval.turns == {} and arcs_of(interval) is None
+    noted = any("/World/Mesh moves on curves, not by a turn" in warning for warning in scene.warnings)
+    assert noted == (move is not matrices)  # which move points straight
 
 
 def test_deforming_meshes_and_straight_motion_have_none(stage):

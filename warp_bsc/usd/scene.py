@@ -352,7 +352,7 @@ class Scene:
         start, end = self.times[index : index + 2]
         with self._collecting(self._record.messages, self.path):
             turns, bent = segment.turns(start, end) if self.turning and end > start else ({}, [])
-        notes = [f"subdivide: {name} turns, not at one rate about one axis: checked on straight paths" for name in bent]
+        notes = [f"subdivide: {n} moves on curves, not by a turn at one rate: checked on straight paths" for n in bent]
         self._record.messages += [note for note in notes[:1] if note not in self._record.messages]
         is_joined = not segment.may_jump and bool(self._span and index + 1 < self._span[1])
         return Interval(index, start, end, segment, x0, x1, is_joined, self.take_notes(jumps), tet_positions, turns)

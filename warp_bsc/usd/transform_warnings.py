@@ -88,9 +88,9 @@ def _turn_warning(op: UsdGeom.XformOp, meshes: list[UsdMesh], times: list[float]
         (large,) = np.nonzero((degrees >= _LARGE_TURN * (1.0 - _ROUNDING)) & np.isfinite(degrees))
     if not any(mesh.deforms for mesh in meshes):
         # what does not vary below a turn makes no difference to it
-        ops = {mesh: mesh.transforms.ops(mesh.instance) for mesh in meshes}
+        ops = {mesh: mesh.transforms.ops(None) for mesh in meshes if not mesh.instance}
         varying = {mesh: tuple(op.GetAttr().GetPath() for op in ops[mesh] if op.MightBeTimeVarying()) for mesh in ops}
-        alike = {mesh.name if mesh.instance else varying[mesh]: mesh for mesh in meshes}
+        alike = {varying.get(mesh, mesh.name): mesh for mesh in meshes}
         on_arcs = [_on_arcs(mesh, large.tolist(), times) for mesh in alike.values()]
         large = large[[any(index not in turns for turns in on_arcs) for index in large.tolist()]]
     if not len(large):

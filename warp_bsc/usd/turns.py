@@ -70,18 +70,18 @@ def find_turns(
         return np.array([np.full((4, 4), np.nan) if matrix is None else matrix for matrix in found]).reshape(-1, 4, 4)
 
     ends = [read(share, numbers) for share in (0.0, 1.0, BETWEEN)]
-    bent = are_bent(*ends) & np.isfinite(np.stack(ends)).all(axis=(0, 2, 3))
-    invertible = np.where(bent[:, None, None], ends[0][:, :3, :3], np.eye(3))
-    bent = bent & (np.linalg.cond(invertible) < _LARGEST_CONDITION)
-    some = [number for number, is_bent in zip(numbers, bent.tolist(), strict=True) if is_bent]
+    curved = are_bent(*ends) & np.isfinite(np.stack(ends)).all(axis=(0, 2, 3))
+    invertible = np.where(curved[:, None, None], ends[0][:, :3, :3], np.eye(3))
+    bent = curved & (np.linalg.cond(invertible) < _LARGEST_CONDITION)
+    all_curved, some = ([numbers[i] for i in np.flatnonzero(which)] for which in (curved, bent))
     if not some:
-        return {}, []
+        return {}, all_curved
     shares = [0.0, 1.0, BETWEEN, *_COUNTED[:-1], *_OTHERS]
     matrices = [end[bent] for end in ends] + [read(share, some) for share in shares[len(ends) :]]
     centres, vectors, fit = _fit_turns(np.array(shares), np.stack(matrices, axis=1))
     rows = zip(some, centres, vectors, fit.tolist(), strict=True)
     turns = {number: Turn(centre, vector) for number, centre, vector, fits in rows if fits}
-    return turns, [number for number in some if number not in turns]
+    return turns, [number for number in all_curved if number not in turns]
 
 
 def are_bent(start: np.ndarray, end: np.ndarray, between: np.ndarray) -> np.ndarray:
