@@ -253,7 +253,7 @@ def press_cloth(device, speed, **options):
 
 def test_cloth_that_is_pressed_through_a_plane(device):
     """Its steps after the first take few iterations, what collides elsewhere then all that it needs."""
-    through = r"pass through shape 0 \('ground_plane'\):.* mask = np.full\(1, -1\) and mask\[\[0\]\] = 0"
+    through = r"let them through shape 0 \('ground_plane'\):.* mask = np.full\(1, -1\) and mask\[\[0\]\] = 0"
     with pytest.warns(UserWarning, match=through):
         pressed, frozen, iterations = press_cloth(device, 2.0)
     stuck = iterations[frozen > 0]
