@@ -9,8 +9,9 @@ from bench_commands import fail
 from warp_bsc import CollisionDetector, CollisionMesh
 from warp_bsc.bench.measure.detector import benchmark_detector
 from warp_bsc.bench.scenes.detector import load_scene
-from warp_bsc.bench.timing import count_threads, limited_threads
+from warp_bsc.bench.timing import limited_threads
 from warp_bsc.cli.main import main
+from warp_bsc.detection.run.launch import count_cores
 
 
 def measure(capsys, *arguments):
@@ -120,7 +121,7 @@ def test_wrong_use(capsys, arguments, part):
 def test_threads(capsys):
     before = os.sched_getaffinity(0)
     with limited_threads(1):
-        assert count_threads() == 1
+        assert count_cores() == 1
     assert os.sched_getaffinity(0) == before
     assert json.loads(measure(capsys, "cloth:1000", "--threads", 1, "--json"))["threads"] == 1
     assert os.sched_getaffinity(0) == before

@@ -16,8 +16,8 @@ from measured import write_measurement
 import warp_bsc
 from warp_bsc.bench import record as records
 from warp_bsc.bench.record import describe_run, shorten_path, with_record
-from warp_bsc.bench.timing import count_threads
 from warp_bsc.cli.main import main
+from warp_bsc.detection.run.launch import count_cores
 
 ROOT = Path(__file__).resolve().parents[2]
 GPU = SimpleNamespace(name="a GPU", is_cuda=True)
@@ -33,7 +33,7 @@ def test_machine_date_and_versions():
     before = datetime.datetime.now(datetime.UTC).replace(microsecond=0)
     record = describe_run(["warp-bsc", "bench"], [wp.get_device("cpu"), GPU])
     assert before <= datetime.datetime.fromisoformat(record["date"]) <= datetime.datetime.now(datetime.UTC)
-    assert (record["gpus"], record["cores"]) == (["a GPU"], count_threads())
+    assert (record["gpus"], record["cores"]) == (["a GPU"], count_cores())
     assert record["cpu"]
     assert record["load"] is None or record["load"] >= 0.0
     assert record["python"] == sys.version.split()[0]

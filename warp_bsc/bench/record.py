@@ -17,8 +17,8 @@ from typing import Any
 import warp as wp
 
 from .._version import __version__
+from ..detection.run.launch import count_cores
 from .tables import count
-from .timing import count_threads
 
 COMMIT = "WARP_BSC_COMMIT"
 """Environment variable that names the commit of a copy of the project without git, as on another machine."""
@@ -78,7 +78,7 @@ def describe_run(command: Sequence[str], devices: Iterable[wp.Device] = ()) -> d
         "changed": changed,
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "cpu": _name_cpu(),
-        "cores": count_threads(),
+        "cores": count_cores(),
         "load": _LOAD,
         "gpus": [device.name for device in devices if device.is_cuda],
         "python": platform.python_version(),

@@ -42,11 +42,6 @@ def replay_graph(graph: wp.Graph, device: wp.Device, *, replays: int) -> float:
     return statistics.median(milliseconds)
 
 
-def count_threads() -> int:
-    """Returns the number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 @contextlib.contextmanager
 def limited_threads(count: int | None) -> Iterator[None]:
     """Limits the threads that the block starts to a number of cores; None sets no limit.

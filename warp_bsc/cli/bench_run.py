@@ -35,8 +35,8 @@ from ..bench.scenes import newton_examples as examples_of_newton
 from ..bench.scenes.queries import SEED
 from ..bench.scenes.repair import KNOWN, damaged, load_tangled
 from ..bench.tables import Table
-from ..bench.timing import count_threads, limited_threads
-from ..detection.run.launch import cores
+from ..bench.timing import limited_threads
+from ..detection.run.launch import cores, count_cores
 from ..detection.run.settings import SURFACE_KINDS, PairKind
 from ..mesh_files.mesh_file import is_mesh_file
 from .device import find_device, load_detector, loading_kernels
@@ -241,7 +241,7 @@ def run_detector(arguments: argparse.Namespace) -> None:
         )
 
     with limited_threads(arguments.threads):
-        settings = {"method": arguments.method, "threads": count_threads(), "repeat": arguments.repeat}
+        settings = {"method": arguments.method, "threads": count_cores(), "repeat": arguments.repeat}
         _report(arguments, device, measure(), detector, "detector", **settings)
 
 
@@ -267,7 +267,7 @@ def _measure_random(arguments: argparse.Namespace, device: wp.Device) -> None:
             yield queries.benchmark_queries(kind, count=arguments.count, device=device, repeat=arguments.repeat)[0]
 
     copy_rate = queries.benchmark_copy(device=device, repeat=arguments.repeat)
-    settings = {"threads": count_threads(), "repeat": arguments.repeat, "seed": SEED}
+    settings = {"threads": count_cores(), "repeat": arguments.repeat, "seed": SEED}
     _report(arguments, device, measure(), queries, "queries", **settings, copy_bytes_per_second=copy_rate)
 
 
@@ -279,7 +279,7 @@ def _measure_files(arguments: argparse.Namespace, device: wp.Device) -> None:
         for file in find_query_files([path]):
             given = read_query_file(file)
             points.setdefault((path, kinds[given.kind]), []).append(given.points)
-    threads, measure_kind = count_threads(), given_queries.benchmark_given_queries
+    threads, measure_kind = count_cores(), given_queries.benchmark_given_queries
 
     def measure() -> Generator[dict[str, Any], None, None]:
         with cores(threads):

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from .._version import __version__
-from ..detection.run.launch import cores
+from ..detection.run.launch import cores, count_cores
 from ..detection.run.start import device_names, find_device, gpu_count
 from ..usd.interval import ReadingNotes
 from ..usd.scene import Scene
@@ -171,7 +171,7 @@ def _open(job: bytes, first: int) -> _Opened:
 def _core_count() -> int:
     """Returns the number of cores for this worker: its share of the machine, or the threads that Dask gives it."""
     if _local:
-        return max(1, (os.cpu_count() or 1) // _local[1])
+        return max(1, count_cores() // _local[1])
     from distributed import get_worker  # noqa: PLC0415 (optional)
 
     return get_worker().state.nthreads

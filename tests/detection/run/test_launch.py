@@ -1,12 +1,15 @@
 """Launches on several cores of the CPU."""
 
+import os
 import threading
 
 import numpy as np
 import pytest
 import warp as wp
 
-from warp_bsc.detection.run.launch import cores, launch_over, thread_pool
+from warp_bsc.bench.timing import limited_threads
+from warp_bsc.detection.run import launch
+from warp_bsc.detection.run.launch import cores, count_cores, launch_over, thread_pool
 
 
 @wp.kernel
@@ -22,6 +25,17 @@ def test_every_entry_is_reached_once(threads, count):
     with cores(threads):
         launch_over(add_one, count, inputs=[], outputs=[values], device=values.device, chunk=64)
     assert np.array_equal(values.numpy()[:count], np.ones(count))
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity") or count_cores() < 2, reason="cores cannot be limited")
+def test_a_launch_takes_the_cores_that_its_process_may_use(monkeypatch):
+    sizes = []
+    monkeypatch.setattr(launch, "thread_pool", lambda threads: sizes.append(threads) or thread_pool(threads))
+    values = wp.zeros(10_000, dtype=int, device="cpu")
+    for count in (1, 2):
+        with limited_threads(count):
+            launch_over(add_one, len(values), inputs=[], outputs=[values], device=values.device, chunk=64)
+    assert sizes == [2] and (values.numpy() == 2).all()
 
 
 def test_a_launch_does_not_wait_for_threads_that_are_busy():

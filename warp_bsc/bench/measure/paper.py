@@ -17,14 +17,13 @@ import numpy as np
 import warp as wp
 
 from ... import checker
-from ...detection.run.launch import cores
+from ...detection.run.launch import cores, count_cores
 from ...detection.run.settings import SURFACE_KINDS, PairKind
 from ...kernels.signs import UNSURE
 from ..peers import ipc_toolkit
 from ..peers.ipc_toolkit import CCD_CLASSES, decide_queries, time_queries
 from ..record import shorten_path
 from ..scenes.detector import BenchmarkScene, find_overlapping
-from ..timing import count_threads
 from .detector import benchmark_detector
 from .methods import METHODS, PHASES, MethodRun, Queries, QuerySet, measure_nanoseconds, time_in_turns, trace
 from .worst_case import adversarial_queries, find_worst
@@ -97,7 +96,7 @@ def find_places(devices: list[wp.Device]) -> list[Place]:
         if device.is_cuda:
             places.append(Place(device, None, device.name))
             continue
-        threads = count_threads()
+        threads = count_cores()
         places.append(Place(device, 1, "CPU, 1 core"))
         if threads > 1:
             places.append(Place(device, threads, f"CPU, {threads} cores"))

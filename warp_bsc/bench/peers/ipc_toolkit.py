@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from ...detection.run.launch import count_cores
 from ...detection.run.settings import PairKind
 from ..scenes.detector import BenchmarkScene
-from ..timing import count_threads
 
 CCD_CLASSES = {"tight inclusion": "TightInclusionCCD", "additive": "AdditiveCCD"}
 """Methods of the IPC Toolkit, with the names of their classes, which are used with their default settings."""
@@ -114,7 +114,7 @@ def benchmark_ipc_toolkit(scene: BenchmarkScene, edges: np.ndarray, *, repeat: i
     """
     import ipctk  # noqa: PLC0415 (optional)
 
-    threads = count_threads()
+    threads = count_cores()
     ipctk.set_num_threads(threads)
     x0, x1 = (np.asfortranarray(x, dtype=np.float64) for x in (scene.x0, scene.x1))
     mesh = ipctk.CollisionMesh(x0, np.asfortranarray(edges), np.asfortranarray(scene.faces))

@@ -20,12 +20,16 @@ import warp as wp
 from ..._private_names.of_warp import may_run_in_threads
 from . import compilation, memory  # noqa: F401 (both say so: where kernels are compiled, where memory is short)
 
-_THREADS = os.cpu_count() or 1
-
 THREADS_OF_MULTIPROCESSOR = 1024
 """Threads of a launch over a queue for each multiprocessor of a GPU."""
 
-_threads = contextvars.ContextVar("threads", default=_THREADS)
+
+def count_cores() -> int:
+    """Returns the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+_threads: contextvars.ContextVar[int] = contextvars.ContextVar("threads")
 
 _KERNELS = threading.RLock()
 """Held while a kernel is made or loaded."""
@@ -164,22 +168,14 @@ def launch_over(
         RuntimeError: If the CPU captures a graph, which would keep the present count, see :mod:`.host_function`.
     """
     if device.is_cuda:
-        launch(
-            kernel,
-            count,
-            inputs=[0, *inputs],
-            outputs=outputs,
-            device=device,
-            max_blocks=max_blocks,
-            block_dim=block_dim,
-            record_tape=False,
-        )
+        options = {"max_blocks": max_blocks, "block_dim": block_dim, "record_tape": False}
+        launch(kernel, count, inputs=[0, *inputs], outputs=outputs, device=device, **options)
         return
     if device.is_capturing:
         raise RuntimeError("a graph on the CPU cannot capture this, as the host reads results between launches")
     if not count:
         return
-    threads = _threads.get() if may_run_in_threads(kernel) else 1
+    threads = _threads.get(count_cores()) if may_run_in_threads(kernel) else 1
     chunk = max(chunk, -(-count // (8 * threads if threads > 1 else 1)))
     # other threads only run commands: Warp cannot load a kernel and pack its arguments in several threads at once
     options = {"outputs": outputs, "device": device, "record_tape": False, "record_cmd": True}
