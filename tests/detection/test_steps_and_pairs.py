@@ -34,6 +34,11 @@ def collide(mesh, x0, x1, pairs_of=all_pairs):
     return {kind: getattr(bsc.checker, kind)(points) for kind, points in rows.items()}
 
 
+def test_a_mesh_says_how_many_vertices_take_part(device):
+    mesh = bsc.CollisionMesh(FACES[:1], 6, edges=[(3, 4)], device=device)
+    assert repr(mesh) == "CollisionMesh(1 faces, 4 edges, 0 points, 5 of 6 vertices)"
+
+
 def test_the_truth_of_collisions_is_whether_there_are_any(device):
     detector = bsc.CollisionDetector(bsc.CollisionMesh(FACES, 6, device=device), method="exact")
     down = [0, 0, 4.0] * (np.arange(6) >= 3)[:, None]

@@ -171,6 +171,11 @@ class CollisionMesh:
             self.group = checked_bits(1 if group is None else group, "group", self.vertex_count)
             self.mask = checked_bits(-1 if mask is None else mask, "mask", self.vertex_count)
 
+    def __repr__(self) -> str:
+        """Returns the number of elements, and of the vertices that take part."""
+        counts = f"{len(self.faces):,} faces, {len(self.edges):,} edges, {len(self.points):,} points"
+        return f"CollisionMesh({counts}, {len(self.vertices):,} of {self.vertex_count:,} vertices)"
+
     @functools.cached_property
     def pair_filter(self) -> PairFilter:
         """The groups and masks on the device."""

@@ -30,7 +30,6 @@ def count_cores() -> int:
 
 
 _threads: contextvars.ContextVar[int] = contextvars.ContextVar("threads")
-
 _KERNELS = threading.RLock()
 """Held while a kernel is made or loaded."""
 
