@@ -23,13 +23,8 @@ from . import compilation, memory  # noqa: F401 (both say so: where kernels are 
 THREADS_OF_MULTIPROCESSOR = 1024
 """Threads of a launch over a queue for each multiprocessor of a GPU."""
 
-
-def count_cores() -> int:
-    """Returns the number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 _threads: contextvars.ContextVar[int] = contextvars.ContextVar("threads")
+
 _KERNELS = threading.RLock()
 """Held while a kernel is made or loaded."""
 
@@ -109,6 +104,11 @@ def launch_repeatedly(
     for _ in range(times):
         for command in commands:
             command.launch()
+
+
+def count_cores() -> int:
+    """Returns the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @contextlib.contextmanager
