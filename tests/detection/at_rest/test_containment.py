@@ -12,7 +12,7 @@ from warp_bsc.detection.at_rest.containment import ContainmentFinder
 BOX = trimesh.creation.box(bounds=[(0, 0, 0), (1, 1, 1)])
 
 
-def find(solids, *, weld=False, dtype=np.float64, wanted=lambda pairs: np.ones(len(pairs), dtype=bool)):
+def find(solids, *, weld=False, dtype=np.float64, wanted=lambda pairs: np.ones(len(pairs), dtype=bool), worlds=None):
     """Pairs of an inner and an outer solid, each solid given by vertices and faces; and the result."""
     x = np.concatenate([vertices for vertices, _ in solids]).astype(dtype)
     starts = np.cumsum([0, *(len(vertices) for vertices, _ in solids)])
@@ -23,7 +23,7 @@ def find(solids, *, weld=False, dtype=np.float64, wanted=lambda pairs: np.ones(l
         faces = kept.reshape(-1)[faces]
     mesh = bsc.CollisionMesh(faces, len(x), device="cpu")
     found = bsc.CollisionDetector(mesh).intersection_finder().find(x)
-    inside = ContainmentFinder(mesh, bodies).find(x, found, wanted)
+    inside = ContainmentFinder(mesh, bodies, worlds).find(x, found, wanted)
     assert (bodies[inside.faces] == inside.bodies[:, 1]).all()
     return [tuple(pair) for pair in inside.bodies.tolist()], inside, x
 
@@ -119,6 +119,31 @@ def test_bodies_in_one_place_take_the_square_of_their_number(monkeypatch):
         assert find(solids)[0] == [(count, body) for body in range(count)]
         numbers.append(sum(map(len, compared)))
     assert numbers[1] < 4.5 * numbers[0]
+
+
+def test_worlds_in_one_place_take_as_long_as_one_after_the_other(monkeypatch):
+    """Each has a cube and a point in it; what is compared grows with the worlds, not with their square."""
+    expand, compared = containment.expand_in_chunks, []
+
+    def expand_and_count(first, last):
+        compared.append(int((last - first).sum()))
+        return expand(first, last)
+
+    monkeypatch.setattr(containment, "expand_in_chunks", expand_and_count)
+    numbers = []
+    for count in (4, 16):
+        compared.clear()
+        x, faces = box((0, 0, 0), (3, 3, 3))
+        bodies, x = np.repeat(np.arange(count), len(faces)), np.tile(x, (count, 1))
+        faces = np.tile(faces, (count, 1)) + 8 * bodies[:, None]
+        worlds, points = np.arange(count)[::-1], np.full((count, 3), (1.0, 1.25, 1.5))
+        finder = ContainmentFinder(bsc.CollisionMesh(faces, len(x), device="cpu"), bodies, worlds)
+        found = finder.find_points(x, points, np.arange(count), lambda pairs: np.ones(len(pairs), dtype=bool))
+        assert found.tolist() == [[point, count - 1 - point] for point in range(count)]
+        numbers.append(sum(compared))
+    assert numbers[1] == 4 * numbers[0]
+    nested = [box((0, 0, 0), (3, 3, 3)), box((1, 1, 1), (2, 2, 2))]
+    assert find(nested, worlds=np.array([7, 7]))[0] == [(1, 0)] and find(nested, worlds=np.array([7, 8]))[0] == []
 
 
 def test_open_and_hollow_and_disoriented_bodies():

@@ -2,7 +2,7 @@
 
 import functools
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -13,6 +13,8 @@ from ..._sorted_keys import expand_in_chunks, expand_ranges
 from ..mesh import CollisionMesh
 from .body_parts import BodyParts, pair_keys
 from .intersections import Intersections, points_on_faces
+
+_APART = 0x1E3779B97F4A7C15  # what keys of cells differ by from one world to the next, modulo 2**64
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,15 +64,17 @@ class ContainmentFinder:
     The result is exact: signs that floating point does not certify are computed exactly.
     """
 
-    def __init__(self, mesh: CollisionMesh, bodies: np.ndarray):
+    def __init__(self, mesh: CollisionMesh, bodies: np.ndarray, worlds: np.ndarray | None = None):
         """Stores a mesh, whose parts are found when they are first needed.
 
         Args:
             mesh: The mesh. Its faces turn counterclockwise seen from outside. Bodies may have vertices in common.
             bodies: Body of each face, then of each of ``mesh.free_edges``, integers from 0, shape [n]. Those with -1
                 are left out; their vertices belong to others as well.
+            worlds: World of each body, which contains nothing of another one, integers; None: all are in one.
         """
         self._mesh, self._bodies = mesh, bodies.astype(np.int64)
+        self._worlds = np.zeros(bodies.max(initial=0) + 1, np.int64) if worlds is None else worlds.astype(np.int64)
 
     def find(self, x: np.ndarray, found: Intersections, is_sought: Callable[[np.ndarray], np.ndarray]) -> Containment:
         """Returns the parts of bodies that are inside others in one configuration.
@@ -86,7 +90,8 @@ class ContainmentFinder:
         parts = self._parts
         low, high = parts.boxes(x)
         (outer,) = np.nonzero(parts.closed)
-        pairs = enclosing_boxes(low, high, low[outer], high[outer], 3)
+        world = self._worlds[parts.body]
+        pairs = enclosing_boxes((low, high), (low[outer], high[outer]), 3, world, world[outer])
         pairs[:, 1] = outer[pairs[:, 1]]
         pairs = pairs[parts.body[pairs[:, 0]] != parts.body[pairs[:, 1]]]
         pairs = pairs[is_sought(parts.body[pairs])]
@@ -105,13 +110,14 @@ class ContainmentFinder:
         return self._decide(x, found, pairs[kept], is_touching[kept])
 
     def find_points(
-        self, x: np.ndarray, points: np.ndarray, is_sought: Callable[[np.ndarray], np.ndarray]
+        self, x: np.ndarray, points: np.ndarray, world: np.ndarray, is_sought: Callable[[np.ndarray], np.ndarray]
     ) -> np.ndarray:
         """Returns which points are strictly inside which bodies in one configuration.
 
         Args:
             x: Positions of the vertices, finite, any unit of length, shape [vertex_count, 3].
             points: The points, finite, of the same type, shape [n, 3].
+            world: World of each point, shape [n].
             is_sought: Returns which pairs of a point and a body are looked for, given shape [m, 2].
 
         Returns:
@@ -121,9 +127,9 @@ class ContainmentFinder:
         if not len(self._bodies) or not len(points) or not self._parts.closed.any():
             return none
         parts = self._parts
-        low, high = parts.boxes(x)
         (closed,) = np.nonzero(parts.closed)
-        pairs = enclosing_boxes(points, points, low[closed], high[closed], 3)
+        boxes = [corner[closed] for corner in parts.boxes(x)]
+        pairs = enclosing_boxes((points, points), boxes, 3, world.astype(np.int64), self._worlds[parts.body[closed]])
         pairs[:, 1] = closed[pairs[:, 1]]
         of_body = np.stack([pairs[:, 0], parts.body[pairs[:, 1]]], axis=1)
         kept = is_sought(of_body)
@@ -142,11 +148,7 @@ class ContainmentFinder:
     def _decide(self, x: np.ndarray, found: Intersections, pairs: np.ndarray, is_touching: np.ndarray) -> Containment:
         """Returns which parts are inside, given pairs of a part and a closed one that do not pass through each other.
 
-        Args:
-            x: As of :meth:`find`.
-            found: As of :meth:`find`.
-            pairs: Pairs of parts where the box of one is in that of the other, shape [m, 2].
-            is_touching: Whether they touch each other, shape [m].
+        The box of the first of a pair is in that of the second; ``is_touching`` says whether they touch, shape [m].
         """
         parts = self._parts
         of_body = np.stack([pairs[:, 0], parts.body[pairs[:, 1]]], axis=1)
@@ -199,7 +201,9 @@ class ContainmentFinder:
         keys_compared, queries = keys_compared[order], compared[order, 0]
         faces = self._faces_ahead(x, points, compared[:, 1])
         corners = x[self._mesh.faces[faces]].astype(np.float64)
-        low, high = corners.min(axis=1), corners.max(axis=1)
+        low, high, part_of_face = corners.min(axis=1), corners.max(axis=1), parts.of_face[faces]
+        world = np.zeros(len(points), dtype=np.int64)
+        world[place[compared[:, 0]]] = self._worlds[parts.body[compared[:, 1]]]
 
         def pair_up(box_low: np.ndarray, axes: int, sought: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             """Returns points and faces whose box contains the point along the first axes of y, z and x.
@@ -207,9 +211,9 @@ class ContainmentFinder:
             Only those are returned that a sought query compares: pairs of a point and a face; and rows of a pair and a
             query, in two arrays.
             """
-            turned = [1, 2, 0]
-            found = enclosing_boxes(points[:, turned], points[:, turned], box_low[:, turned], high[:, turned], axes)
-            keys = found[:, 0] * len(parts.body) + parts.of_face[faces[found[:, 1]]]
+            places, *boxes = (array[:, [1, 2, 0]] for array in (points, box_low, high))
+            found = enclosing_boxes((places, places), boxes, axes, world, self._worlds[parts.body[part_of_face]])
+            keys = found[:, 0] * len(parts.body) + part_of_face[found[:, 1]]
             bounds = np.searchsorted(keys_compared, keys), np.searchsorted(keys_compared, keys, side="right")
             pairs, at = expand_ranges(*bounds)
             kept = sought[queries[at]]
@@ -238,15 +242,9 @@ class ContainmentFinder:
     def _choose_vertices(
         self, cases: np.ndarray, touches: np.ndarray, found: Intersections
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the vertices that decide whether parts are inside bodies.
+        """Returns the vertices that decide whether parts are inside bodies, after the case of each, ascending.
 
-        Args:
-            cases: The parts and the bodies, sorted, shape [n, 2].
-            touches: Whether they touch each other, shape [n]. If not, one vertex decides.
-            found: The intersections.
-
-        Returns:
-            The case of each vertex, ascending, and the vertices, each of shape [m].
+        Cases are sorted pairs of a part and a body. Where one does not touch the other, one vertex decides.
         """
         parts = self._parts
         chosen = [np.array([parts.first_vertex[part]]) for part in cases[:, 0]]
@@ -273,23 +271,24 @@ class ContainmentFinder:
 
 
 def enclosing_boxes(
-    low: np.ndarray, high: np.ndarray, outer_low: np.ndarray, outer_high: np.ndarray, axes: int
+    inner: Sequence[np.ndarray], outer: Sequence[np.ndarray], axes: int, world: np.ndarray, outer_world: np.ndarray
 ) -> np.ndarray:
-    """Returns the pairs of an inner box and an outer one that contains it, borders included.
+    """Returns the pairs of an inner box and an outer one of the same world that contains it, borders included.
 
     Outer boxes are in classes by size. For each class, a grid holds the boxes by their lowest corners; its cells are as
     large as the outer boxes, so that an outer box is in the cell of the inner box or in the one before along some axes.
 
     Args:
-        low: Lowest corners of the inner boxes, shape [n, 3].
-        high: Highest corners.
-        outer_low: Lowest corners of the outer boxes, shape [m, 3].
-        outer_high: Highest corners.
+        inner: Lowest and highest corners of the inner boxes, each of shape [n, 3].
+        outer: Those of the outer boxes, each of shape [m, 3].
         axes: Number of axes, from the first one, along which the boxes are finite, and the grid has cells.
+        world: World of each inner box, int64.
+        outer_world: That of each outer box.
 
     Returns:
         Indices of the inner and the outer boxes, sorted, shape [k, 2].
     """
+    (low, high), (outer_low, outer_high) = inner, outer
     found = [np.zeros((0, 2), dtype=np.int64)]
     near = np.zeros(0, dtype=np.int64)
     if len(low):
@@ -307,19 +306,20 @@ def enclosing_boxes(
         cell = smallest * 2.0**number * (1.0 + 1e-6)  # cells are numbered with rounding
         (members,) = np.nonzero(size_class == number)
         keys = (np.floor((outer_starts[members] - corner) / cell).astype(np.int64) + 1) @ weights
+        keys += _APART * outer_world[near[members]]
         order = np.argsort(keys, kind="stable")
         keys, members = keys[order], near[members[order]]
-        of_inner = (np.floor((starts - corner) / cell).astype(np.int64) + 1) @ weights
+        of_inner = (np.floor((starts - corner) / cell).astype(np.int64) + 1) @ weights + _APART * world
         for step in itertools.product((0, 1), repeat=axes):
             cells = of_inner - np.array(step) @ weights
             first, last = np.searchsorted(keys, cells), np.searchsorted(keys, cells, side="right")
             for rows, places in expand_in_chunks(first, last):
-                inner, outer = rows, members[places]
+                kept = world[rows] == outer_world[members[places]]
+                i, j = rows[kept], members[places[kept]]
                 for axis in range(3):
-                    kept = outer_low[outer, axis] <= low[inner, axis]
-                    kept &= high[inner, axis] <= outer_high[outer, axis]
-                    inner, outer = inner[kept], outer[kept]
-                found.append(np.stack([inner, outer], axis=1))
+                    kept = (outer_low[j, axis] <= low[i, axis]) & (high[i, axis] <= outer_high[j, axis])
+                    i, j = i[kept], j[kept]
+                found.append(np.stack([i, j], axis=1))
     pairs = np.concatenate(found)
     return pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
 

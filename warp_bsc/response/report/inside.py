@@ -45,7 +45,6 @@ class _Solids(NamedTuple):
     shape: np.ndarray  # of each body, -1 for a soft body
     soft_body: np.ndarray  # first particle of each body, -1 for a shape
     body: np.ndarray  # rigid body of each shape, -1 for none
-    world: np.ndarray  # of each body
     soft_body_of: np.ndarray  # first particle of the soft body of each particle, -1 for none
 
 
@@ -113,13 +112,12 @@ class InsideFinder:
 
         def are_candidates(pairs):
             particle, body = particles[pairs[:, 0]], pairs[:, 1]
-            found = holds[body] & (world[particle] == solids.world[body])
-            found &= (soft[particle] < 0) | (soft[particle] != solids.soft_body[body])
+            found = holds[body] & ((soft[particle] < 0) | (soft[particle] != solids.soft_body[body]))
             found &= movable[particle] | is_movable[body]
             return found & meets[kind_of_vertex[particle], body]
 
         x = np.where(finite[:, None], x, 0.0)
-        found = solids.finder.find_points(x, x[particles], are_candidates)
+        found = solids.finder.find_points(x, x[particles], world[particles], are_candidates)
         return np.stack([particles[found[:, 0]], solids.shape[found[:, 1]], solids.soft_body[found[:, 1]]], axis=1)
 
     def _find_behind_planes(self, x, particles, planes, movable, moves):
@@ -177,14 +175,14 @@ class InsideFinder:
         faces = np.concatenate([soft_faces, shape_faces])
         of_face = np.concatenate([of_soft_face, len(soft_bodies) + of_shape_face.ravel()])
         none, no_shape = np.full(len(soft_bodies), -1), np.full(len(copies), -1)
+        world = np.concatenate([world[soft_bodies], copies[:, 1]])
         return _Solids(
-            ContainmentFinder(CollisionMesh(faces, mesh.vertex_count, device="cpu"), of_face),
+            ContainmentFinder(CollisionMesh(faces, mesh.vertex_count, device="cpu"), of_face, world),
             faces,
             of_face,
             shape=np.concatenate([none, copies[:, 0]]),
             soft_body=np.concatenate([soft_bodies, no_shape]),
             body=np.concatenate([none, mesh.shape_vertices.body[corners[places] - count]]),
-            world=np.concatenate([world[soft_bodies], copies[:, 1]]),
             soft_body_of=soft_body_of,
         )
 
