@@ -9,6 +9,7 @@ import warp as wp
 from newton_scenes import add_patch
 
 import warp_bsc as bsc
+from warp_bsc.detection.run import launch
 from warp_bsc.implicit.contact.flow import Phase
 
 DT = 1.0 / 60.0
@@ -189,3 +190,20 @@ def test_reset_worlds_start_anew_and_masked_ones_stand(together):
         for one, other in zip(run.ends, together.ends, strict=True):
             assert same(one[-1:], other[len(one) - 1 : len(one)] if one else [])
     assert resets > 3
+
+
+def test_worlds_on_several_cores_of_a_cpu_are_those_on_one(monkeypatch):
+    """More threads than cores too, so that they are interrupted anywhere."""
+    ends, used, pool = [], set(), launch.thread_pool
+    monkeypatch.setattr(launch, "thread_pool", lambda threads: used.add(threads) or pool(threads))
+    for threads in (1, 2, 7):
+        with launch.cores(threads):
+            run = Run(range(5), "cpu")
+            for _ in range(STEPS):
+                run.step()
+        ends.append(run.ends)
+    assert used >= {2, 7}
+    for others in ends[1:]:
+        for one, other in zip(ends[0], others, strict=True):
+            for before, after in zip(one, other, strict=True):
+                assert all(np.array_equal(x, y) for x, y in zip(before, after, strict=True))

@@ -308,15 +308,8 @@ class SolverImplicit(SolverCCD):
     def _read_arrays(self):
         """Returns the arrays that steps read beside those of states and get gradients, which a tape sets to zero."""
         model, friction = self.model, self._motion.friction
-        names = [
-            "particle_inv_mass",
-            "body_inv_mass",
-            "body_inertia",
-            "body_inv_inertia",
-            "gravity",
-            *(f"tri_{name}" for name in ("poses", "areas", "materials")),
-        ]
-        names += ["tet_poses", "tet_materials"]
+        names = ["gravity", "particle_inv_mass", "body_inv_mass", "body_inertia", "body_inv_inertia"]
+        names += ["tri_poses", "tri_areas", "tri_materials", "tet_poses", "tet_materials"]
         names += [f"edge_{name}" for name in ("rest_angle", "rest_length", "bending_properties")]
         names += [f"spring_{name}" for name in ("rest_length", "stiffness", "damping")]
         distances = [] if self.mesh.distance_arrays is None else self.mesh.distance_arrays.inputs

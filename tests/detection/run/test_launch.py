@@ -9,13 +9,32 @@ import warp as wp
 
 from warp_bsc.bench.timing import limited_threads
 from warp_bsc.detection.run import launch
-from warp_bsc.detection.run.launch import cores, count_cores, launch_over, thread_pool
+from warp_bsc.detection.run.launch import cores, count_cores, launch_on_cores, launch_over, thread_pool
+from warp_bsc.implicit.contact.team import add_to, lower_int_to
 
 
 @wp.kernel
 def add_one(first: int, values: wp.array[int]):
     i = first + wp.tid()
     wp.atomic_add(values, i, 1)
+
+
+@wp.kernel
+def take_number(taken: wp.array[int], values: wp.array[int], least: wp.array[int]):
+    number = add_to(taken, 0, 1)
+    values[number] = values[number] + 1
+    lower_int_to(least, number % 3, -number)
+
+
+@pytest.mark.parametrize("threads", [1, 2, 5])
+@pytest.mark.parametrize("count", [0, 1, 5, 64, 100_001])
+def test_every_number_is_taken_once(threads, count):
+    taken, least, values = (wp.zeros(max(n, 1), dtype=int, device="cpu") for n in (1, 3, count))
+    with cores(threads):
+        launch_on_cores(take_number, count, inputs=[taken, values, least], device=values.device)
+    assert taken.numpy()[0] == count and np.array_equal(values.numpy()[:count], np.ones(count))
+    if count > 3:
+        assert sorted(least.numpy()) == [1 - count, 2 - count, 3 - count]
 
 
 @pytest.mark.parametrize("threads", [1, 2, 5])

@@ -136,16 +136,10 @@ class BodyParts:
 
 
 def _divide(elements: np.ndarray, is_shared: np.ndarray, bodies: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns elements with a number for each body that shares them.
+    """Returns the elements of each face, -1 for none, with a number for each body that shares them.
 
-    Args:
-        elements: Numbers of the elements of each face, -1 for none, shape [n, 3].
-        is_shared: Which elements bodies may share, shape [m].
-        bodies: Body of each face, shape [n].
-
-    Returns:
-        The elements of each face, those shared with new numbers from m on, shape [n, 3], and the element of each
-        number, shape [k]. New numbers are sorted by element, then by body.
+    Those shared, of m elements, have numbers from m on, sorted by element, then by body; also returned is the element
+    of each number.
     """
     divided = elements.astype(np.int64)
     places = is_shared[elements] & (elements >= 0)

@@ -187,13 +187,8 @@ class ContainmentFinder:
         """Returns on which side of its body each query is.
 
         A point and a face are decided once, however many queries compare them: those of bodies in one place are many.
-
-        Args:
-            x: Positions of the vertices, shape [vertex_count, 3].
-            points: The points, of the same type, shape [p, 3].
-            place: Point of each query, shape [n].
-            compared: Pairs of a query and a closed part of its body, shape [m, 2].
-            may_touch: For which queries to look whether the point is on a part, shape [n].
+        Query i is of point ``place[i]``, and may be on a part if ``may_touch[i]``; ``compared`` are pairs of a query
+        and a closed part of its body.
         """
         parts = self._parts
         keys_compared = pair_keys(np.stack([place[compared[:, 0]], compared[:, 1]], axis=1), len(parts.body))

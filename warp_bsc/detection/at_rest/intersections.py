@@ -106,16 +106,9 @@ def _decide_exactly(dtype: type, limbs: int) -> wp.Kernel:
 def _decided(
     mesh: CollisionMesh, x: wp.array, edges: wp.array, across: wp.array, pairs: wp.array, status: wp.array, count: int
 ) -> np.ndarray:
-    """Returns the status of pairs after the exact phase, UNSURE only where exponents are too far apart for it.
+    """Returns the status of pairs (edge, face) after the exact phase, which overwrites ``status``.
 
-    Args:
-        mesh: The mesh.
-        x: Positions, array of vec3 or vec3d.
-        edges: Vertices of both ends of each edge, two-dimensional array of int.
-        across: Vertices across the sides of each face, as of :attr:`.CollisionMesh.across`, likewise.
-        pairs: (edge, face), array of vec2i.
-        status: Status of each pair, array of int8, which is overwritten.
-        count: Number of pairs, at least 1.
+    It is UNSURE only where exponents are too far apart. There is a pair at least.
     """
     for limbs in BITS:
         if not (status[:count].numpy() == UNSURE).any():

@@ -174,23 +174,41 @@ def launch_over(
         raise RuntimeError("a graph on the CPU cannot capture this, as the host reads results between launches")
     if not count:
         return
-    threads = _threads.get(count_cores()) if may_run_in_threads(kernel) else 1
+    threads = cores_for(kernel, device)
     chunk = max(chunk, -(-count // (8 * threads if threads > 1 else 1)))
-    # other threads only run commands: Warp cannot load a kernel and pack its arguments in several threads at once
-    options = {"outputs": outputs, "device": device, "record_tape": False, "record_cmd": True}
-    with _loading(kernel, device, 0):
-        commands = [wp.launch(kernel, min(chunk, count), inputs=[0, *inputs], **options)]
+    _run(kernel, count, chunk, threads, inputs=[0, *inputs], outputs=outputs, device=device, has_first=True)
+
+
+def launch_on_cores(
+    kernel: wp.Kernel, count: int, *, inputs: list, outputs: Sequence[Any] = (), device: wp.Device, block_dim: int = 256
+) -> None:
+    """Launches a kernel whose threads take numbers as they come on a CPU: on each core ``wp.tid()`` begins anew."""
+    threads = cores_for(kernel, device)
+    if device.is_cuda or min(threads, count) <= 1:
+        launch(kernel, count, inputs=inputs, outputs=outputs, device=device, block_dim=block_dim)
+        return
+    _run(kernel, count, -(-count // (8 * threads)), threads, inputs=inputs, outputs=outputs, device=device)
+
+
+def cores_for(kernel: wp.Kernel, device: wp.Device) -> int:
+    """Returns how many cores of the CPU run a kernel at once: one while it captures a graph."""
+    return _threads.get(count_cores()) if may_run_in_threads(kernel) and not device.is_capturing else 1
+
+
+def _run(kernel: wp.Kernel, count: int, chunk: int, threads: int, has_first: bool = False, **options: Any) -> None:
+    """Runs parts of a launch in this thread and, as soon as they are free, in others, so that short ones wait for none.
+
+    The others only run commands: Warp cannot load a kernel and pack its arguments in several threads at once.
+    """
+    with _loading(kernel, options["device"], 0):
+        commands = [wp.launch(kernel, min(chunk, count), record_tape=False, record_cmd=True, **options)]
     for first in range(chunk, count, chunk):  # to pack all arguments again would take longer than many a chunk
         command = copy.copy(commands[0])
         command.params = list(command.params)
-        command.set_param_at_index(0, first)
+        if has_first:
+            command.set_param_at_index(0, first)
         command.set_dim(min(chunk, count - first))
         commands.append(command)
-    _run(commands, threads)
-
-
-def _run(commands: list[wp.Launch], threads: int) -> None:
-    """Runs commands in this thread and, as soon as they are free, in others, so that short ones wait for none."""
     waiting = iter(commands)
 
     def work() -> None:

@@ -11,8 +11,9 @@ written in the phase, as some threads may still be reading it.
 import warp as wp
 
 from . import assembly, bounds, contact_lists, decisions, held, merit, near, steps
-from .flow import Flow, Phase, Place, Problem, count_block, wait_for_team
+from .flow import Flow, Phase, Place, Problem
 from .system import end_of_contacts
+from .team import add_to, count_block, on_gpu, wait_for_team
 
 wp.set_module_options({"enable_backward": False})
 
@@ -112,7 +113,7 @@ def _leave(w: int, state: wp.vec4i, p: Problem):
         phase = int(Phase.DISPLACE)
         if p.flow.phase.shape[0] > 1:
             following = 1 - p.flow.turn[0]
-            p.flow.listed[following * p.flow.phase.shape[0] + wp.atomic_add(p.flow.count, following, 1)] = w
+            p.flow.listed[following * p.flow.phase.shape[0] + add_to(p.flow.count, following, 1)] = w
     elif phase == Phase.END:
         p.progress.leaves[w] = 0
     else:
@@ -161,12 +162,16 @@ def _advance(
     if of_all == 0:
         count = p.flow.count[turn] + int(0)
     together = wp.max(1, blocks // wp.max(1, count))
+    if on_gpu() == 0:
+        together = 1
     at = Place()
     at.thread = block % together * n + lane
     at.threads = together * n
     at.blocks = together
     at.spread = _spread(at.thread, at.threads)
     number = block // together
+    if on_gpu() == 0:
+        number = add_to(p.flow.taken, 0, 1)
     while number < count:
         w = number
         if of_all == 0:
@@ -193,8 +198,8 @@ def _advance(
                 _leave(w, state, p)
         number = int(count)
         if together == 1:
-            number = blocks + count_block(p.flow.taken)
-    if worlds > 1:
+            number = blocks * on_gpu() + count_block(p.flow.taken)
+    if worlds > 1 or on_gpu() == 0:
         _end_launch(p.flow, lane, n, blocks)
 
 

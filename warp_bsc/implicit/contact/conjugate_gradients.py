@@ -14,6 +14,7 @@ import warp as wp
 from ...kernels.native_text import header
 from .matrix import Matrix
 from .system import Contacts, Unknowns
+from .team import add_to, on_gpu
 
 _LARGEST_BLOCK = 1024
 """Threads of the only block of a world, at most."""
@@ -35,7 +36,7 @@ class Team:
     Attributes:
         blocks: Number of blocks.
         parts: Threads that share a row, a power of 2.
-        arrived: How often blocks have waited for the others, shape [worlds].
+        arrived: How often blocks have waited for the others, shape [worlds]; on a CPU the first counts threads.
         sums: Two of each block of each world, shape [worlds, 2 blocks].
         limit: Square of the residual at which the first solve of a Newton step ends, shape [worlds].
     """
@@ -157,6 +158,8 @@ def _make_solve_kernel(bounds: int, parts: int, kept: int, shared: bool):
         negative gradient if there is none: both are directions in which the energy falls. What is given stays given.
         """
         thread = wp.tid()
+        if on_gpu() == 0:
+            thread = add_to(team.arrived, 0, 1)
         number, lane = thread // wp.block_dim(), thread % wp.block_dim()
         world, block = number // team.blocks, number % team.blocks
         if thread == 0:

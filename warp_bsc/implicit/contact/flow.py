@@ -1,4 +1,4 @@
-"""The flow of Newton steps: phases of worlds, what they read and write, and the threads that wait for each other."""
+"""The flow of Newton steps: phases of worlds, and what they read and write."""
 
 from enum import IntEnum
 
@@ -163,52 +163,6 @@ class Problem:
     far_change: float
     max_steps: int
     max_late_steps: int
-
-
-@wp.func_native(
-    snippet="""
-#if defined(__CUDA_ARCH__)
-    __syncthreads();
-    if (blocks > 1) {
-        if (threadIdx.x == 0) {
-            __threadfence();
-            unsigned* count = (unsigned*)arrived.data + world;
-            const unsigned before = atomicAdd(count, 1u);
-            const unsigned all = (before / blocks + 1u) * blocks;
-            while ((int)(*(volatile unsigned*)count - all) < 0) {}
-            __threadfence();
-        }
-        __syncthreads();
-    }
-#endif
-"""
-)
-def wait_for_team(arrived: wp.array[int], world: int, blocks: int):
-    """Waits until all threads of a world are here, and sees what they have written; its blocks must all be running."""
-    ...
-
-
-@wp.func_native(
-    snippet="""
-#if defined(__CUDA_ARCH__)
-    __shared__ int number;
-    __syncthreads();
-    if (threadIdx.x == 0) {
-        __threadfence();
-        number = atomicAdd(values.data, 1);
-    }
-    __syncthreads();
-    const int found = number;
-    __syncthreads();
-    return found;
-#else
-    return values.data[0]++;
-#endif
-"""
-)
-def count_block(values: wp.array[int]) -> int:
-    """Adds 1 to a number for the block of a thread, where all of its threads are here, and returns what it was."""
-    ...
 
 
 @wp.func

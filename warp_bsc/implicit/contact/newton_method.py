@@ -11,7 +11,7 @@ import warp as wp
 
 from ..._profiling import phase
 from ...detection.pipeline import MIN_CAPACITY
-from ...detection.run.launch import retry_until_fits
+from ...detection.run.launch import cores_for, launch_on_cores, retry_until_fits
 from ...detection.run.settings import capacity_for
 from ...response.contacts.queue import PairQueue, queues_of
 from ...response.report.forces.structs import ContactRows, ImpulseSums, Sides
@@ -102,14 +102,10 @@ class NewtonMethod:
         results: StepResults,
         unconverged_steps: wp.array[wp.int64],
     ):
-        """Allocates buffers.
+        """Allocates buffers for the steps of a workspace, in at most ``max_steps`` Newton steps each.
 
-        Args:
-            work: The workspace of the steps: motion, mesh and detection.
-            max_steps: Newton steps of a step at most.
-            precise: Whether steps go on until less is left than what counts as converged.
-            results: Where solves write what they did.
-            unconverged_steps: Where they count steps in which a world did not converge.
+        If ``precise``, they go on until less is left than what counts as converged. Solves write what they did into
+        ``results``, and count steps in which a world did not converge.
         """
         self._work, self.max_steps, self._precision = work, max_steps, _PRECISE if precise else 1.0
         mesh = self.mesh = work.mesh
@@ -174,9 +170,7 @@ class NewtonMethod:
         reach = self._reach(mesh)
         settings.reach = wp.array(reach, dtype=float, device=device)
         settings.elasticity = wp.array(self._elasticity(mesh), dtype=float, device=device)
-        is_of_face = np.zeros(vertices)
-        is_of_face[mesh.faces.ravel()] = 1
-        settings.is_of_face = array(is_of_face)
+        settings.is_of_face = array(np.isin(np.arange(vertices), mesh.faces))
         settings.load = wp.zeros(vertices, dtype=float, device=device)
         worlds = mesh.device_world.numpy()
         of_bodies = np.full(vertices, np.inf)
@@ -343,10 +337,16 @@ class NewtonMethod:
         p.least_change = self._precision * self._least_speed * self._dt
         p.far_change = self._metre * _FAR_SPEED * self._dt
         p.max_steps, p.max_late_steps = self.max_steps, max(LATE_STEPS, self.max_steps)
-        progress = p.progress
-        for zeros in (progress.active, progress.given_moves, progress.fastest, p.flow.arrived, p.flow.lacks):
+        progress, flow = p.progress, p.flow
+        for zeros in (
+            progress.active,
+            progress.given_moves,
+            progress.fastest,
+            flow.arrived,
+            flow.lacks,
+            self.iterations,
+        ):
             zeros.zero_()
-        self.iterations.zero_()
         given = [motion, self.mesh.model.gravity, wp.float64(dt)]
         self._launch(steps.begin_unknowns, self._count, given, [p.unknowns, p.trial, p.progress])
         if self._attachments is not None:
@@ -418,14 +418,15 @@ class NewtonMethod:
 
     def _prepare_candidates(self):
         p = self.problem
-        p.candidates.near.zero_()
-        p.candidates.far.zero_()
+        for zeros in (p.candidates.near, p.candidates.far, p.candidates.listed_others):
+            zeros.zero_()
         p.candidates.listed_edges.fill_(-1)
-        p.candidates.listed_others.zero_()
         inputs = [self._work.step, p.settings, self._work.status.crossings, p.progress]
         for k in range(0, len(self._queues), 2):  # pairs of faces and edges, and then those of points, if there are any
             queues = self._queues[k : k + 2]
-            self._work.launch_over_entries(pairs.prepare_candidates, [*inputs, *queues, p.candidates, p.trial])
+            p.candidates.used.zero_()
+            inputs_of_all = [*inputs, *queues, p.candidates, p.trial]
+            self._work.launch_over_entries(pairs.prepare_candidates, inputs_of_all, on_cores=True)
 
     def _part_touching(self):
         inputs = [self._work.step, self.settings]
@@ -437,8 +438,7 @@ class NewtonMethod:
         of_worlds = "start", "room", "near", "far", "listed_edges", "listed_others"
         sizes: dict = dict.fromkeys(of_worlds, self._work.worlds)
         capacity = sum(len(q.pairs) for q in queues)
-        sizes["used"] = 1
-        sizes["kept"] = capacity if self.mesh.distances is not None else 0
+        sizes |= {"used": 1, "kept": capacity if self.mesh.distances is not None else 0}
         self.problem.candidates = allocate(Candidates, capacity, self._work.device, **sizes)
         self.problem.candidates.room.fill_(capacity)
         self._queues = queues  # last: without memory, they are allocated again
@@ -492,24 +492,24 @@ class NewtonMethod:
     @phase("linear solve")
     def _solve(self):
         work, team, p = self._work, self._team, self.problem
-        if team.blocks > 1:
+        if team.blocks > 1 or work.device.is_cpu:
             team.arrived.zero_()
         inputs = [p.matrix, p.contacts, p.unknowns, p.progress.solving]
         inputs += [self._tolerance, _MAX_ITERATIONS, p.flow.solves, team]
         outputs = [p.vectors, self.iterations, p.flow.solves_next]
         options = {"device": work.device, "block_dim": self._threads}
         threads = work.worlds * team.blocks * self._threads
-        wp.launch(self._solve_worlds, threads, inputs=inputs, outputs=outputs, **options)
+        launch_on_cores(self._solve_worlds, threads, inputs=inputs, outputs=outputs, **options)
         self._advance()
 
     @phase("Newton step")
     def _advance(self, resumes=False, of_all=False):
-        work = self._work
-        self.problem.grows = int(self.may_grow and not work.device.is_capturing)
-        threads = self._block if work.device.is_cuda else 1
-        inputs = [int(resumes), int(of_all or work.worlds == 1), threads, self._blocks, self.problem]
-        options = {"device": work.device, "block_dim": self._block}
-        wp.launch(ADVANCE[self._is_many], self._blocks * threads, inputs=inputs, **options)
+        device, worlds, kernel = self._work.device, self._work.worlds, ADVANCE[self._is_many]
+        self.problem.grows = int(self.may_grow and not device.is_capturing)
+        threads = self._block if device.is_cuda else 1
+        blocks = self._blocks if device.is_cuda else min(worlds, cores_for(kernel, device))
+        inputs = [int(resumes), int(of_all or worlds == 1), threads, blocks, self.problem]
+        launch_on_cores(kernel, blocks * threads, inputs=inputs, device=device, block_dim=self._block)
 
     def publish(self, sides: Sides, centres: wp.array[wp.vec3d], sums: ImpulseSums, rows: ContactRows) -> None:
         """Publishes the impulses of the contacts at the end of the last step, if ``keeps_contacts`` is set."""

@@ -11,16 +11,9 @@ from ...response.contacts.rules import ContactClass, crossed_at_start, inverse_m
 from ...response.state.planes import MovingPlanes, is_filtered_by_plane, signed_distance
 from ...response.state.structs import Motion, Step, body_of
 from ...response.state.vectors import HALF, ONE, ZERO, corners_of, to_double
-from . import barrier
-from .distance_bounds import (
-    ROUNDED_DOWN,
-    direction_of_bits,
-    distance_along,
-    distance_of_boxes,
-    rounding_of,
-    seen_from_last,
-)
+from . import barrier, distance_bounds
 from .system import Progress, key_of_pair
+from .team import add_to, lower_int_to, on_gpu
 
 wp.set_module_options({"enable_backward": False})
 
@@ -308,8 +301,8 @@ def distance_bound(candidates: Candidates, i: int, kind: int, a: wp.vec3, b: wp.
 
     The second is as good as the distance until the elements turn, and much faster to find. Points are seen from d.
     """
-    along = distance_along(kind, direction_of_bits(candidates.normal[i]), a, b, c)
-    return wp.max(along, distance_of_boxes(kind, a, b, c)) - rounding_of(a, b, c)
+    along = distance_bounds.distance_along(kind, distance_bounds.direction_of_bits(candidates.normal[i]), a, b, c)
+    return wp.max(along, distance_bounds.distance_of_boxes(kind, a, b, c)) - distance_bounds.rounding_of(a, b, c)
 
 
 @wp.func
@@ -403,14 +396,16 @@ def _prepare(
     if motion.distances.radius:
         start, kept = distances_of_pair(motion.distances, queue.kind, corners, a, b, c, d)
     else:
-        u, v, w = seen_from_last(trial.origin, corners)
-        start = wp.float64(distance_of_boxes(queue.kind, u, v, w) - rounding_of(u, v, w))
+        u, v, w = distance_bounds.seen_from_last(trial.origin, corners)
+        start = wp.float64(
+            distance_bounds.distance_of_boxes(queue.kind, u, v, w) - distance_bounds.rounding_of(u, v, w)
+        )
         if not start >= wp.float64(whole):  # farther away, all is the same
             start = barrier.least_distance(queue.kind, a, b, c, d)
     if not start > ZERO:
         if start == ZERO and queue.kind == VERTEX_FACE and settings.reach[corners[1]] == wp.inf:
             if motion.inverse_mass[corners[0]] > 0.0:
-                wp.atomic_min(trial.touched, corners[0], queue.pairs[i][1])
+                lower_int_to(trial.touched, corners[0], queue.pairs[i][1])
                 trial.any_touches[0] = 1
         return
     if crossings[motion.world[corners[0]]] > 0:
@@ -419,7 +414,7 @@ def _prepare(
     level, reach = barrier_of(settings, start, kept, whole)
     pair = queue.pairs[i]
     slot = int(0)
-    world, apart = motion.world[corners[0]], float((start - kept - reach) * wp.float64(ROUNDED_DOWN))
+    world, apart = motion.world[corners[0]], float((start - kept - reach) * wp.float64(distance_bounds.ROUNDED_DOWN))
     is_far = stays_far(apart, progress, world)
     if apart < _far(progress, world) or not is_far:
         slot = candidates.start[world] + take_slot_of(candidates.near, world)
@@ -479,7 +474,12 @@ def prepare_candidates(
     threads: int,
 ):
     """Adds the pairs of two queues to the candidates, but for those that touch or cross at the start of the step."""
-    for i in range(wp.tid(), wp.max(pair_count(first), pair_count(second)), threads):
+    begin, end, stride = wp.tid(), wp.max(pair_count(first), pair_count(second)), threads + int(0)
+    if on_gpu() == 0:  # pairs of a world follow each other: a core has all of most worlds
+        piece = (end + threads - 1) // threads
+        begin, stride = piece * add_to(candidates.used, 0, 1), 1
+        end = wp.min(end, begin + piece)
+    for i in range(begin, end, stride):
         number = int(0)
         while number < 2:
             of = first

@@ -8,10 +8,11 @@ from ...response.state.structs import Motion, Vertices
 from ...response.state.vectors import ONE, ZERO, to_double, to_single
 from .bodies import SolvedBodies, arm_on_body, bend_of, body_vertex, exact_on_body, move_body
 from .decisions import may_cut, takes
-from .flow import Phase, Place, Problem, end_of_vertices, go_on, go_on_with_pairs, has_few, wait_for_team
+from .flow import Phase, Place, Problem, end_of_vertices, go_on, go_on_with_pairs, has_few
 from .merit import add_energy
 from .pairs import Trial, clear_list, moved
 from .system import NOT_UNKNOWN, Progress, Unknowns, displacement, is_solved, lower_to, raise_to, unknown_of_corner
+from .team import wait_for_team
 
 wp.set_module_options({"enable_backward": False})
 

@@ -265,29 +265,22 @@ def block_sum_of_parts(block: wp.mat33, parts: int) -> wp.mat33:
     )
 
 
-@wp.func_native(
-    snippet="""
+_EXTREME = """
 #if defined(__CUDA_ARCH__)
-    atomicMax((int*)values.data + i, __float_as_int(value));
+    atomic{0}((int*)values.data + i, __float_as_int(value));
 #else
-    values.data[i] = wp::max(values.data[i], value);
+    values.data[i] = wp::{1}(values.data[i], value);
 #endif
 """
-)
+
+
+@wp.func_native(snippet=_EXTREME.format("Max", "max"))
 def raise_to(values: wp.array[float], i: int, value: float):
     """Raises a value to another one, both not negative; on GPUs faster than Warp's, by their bits."""
     ...
 
 
-@wp.func_native(
-    snippet="""
-#if defined(__CUDA_ARCH__)
-    atomicMin((int*)values.data + i, __float_as_int(value));
-#else
-    values.data[i] = wp::min(values.data[i], value);
-#endif
-"""
-)
+@wp.func_native(snippet=_EXTREME.format("Min", "min"))
 def lower_to(values: wp.array[float], i: int, value: float):
     """Lowers a value to another one, as :func:`raise_to`."""
     ...

@@ -30,13 +30,9 @@ class Elements:
     """
 
     def __init__(self, kernel: wp.Kernel, vertices: wp.array, rows: wp.array, jacobians: wp.Kernel | None = None):
-        """Allocates buffers for forces on ``vertices``.
+        """Allocates buffers for forces on ``vertices`` by a kernel of the form above; ``rows`` are their unknowns.
 
-        Args:
-            kernel: A kernel of the form above.
-            vertices: Vertices of the elements, int32, shape [capacity, size].
-            rows: Their unknowns, likewise.
-            jacobians: A kernel that computes Jacobians from the same but the time, in place of adjoints, a corner each.
+        The kernel ``jacobians`` computes Jacobians from the same but the time, in place of adjoints, a corner each.
         """
         self._jacobians = jacobians
         self.kernel, self.vertices, self.rows, self.parameters = kernel, vertices, rows, []

@@ -100,14 +100,7 @@ class StepGradients:
     """
 
     def __init__(self, work: Workspace, newton: NewtonMethod, converged: wp.array[wp.bool], report: GradientReport):
-        """Allocates buffers.
-
-        Args:
-            work: The workspace of the steps.
-            newton: The solver, which keeps contacts at the end of its steps.
-            converged: Whether it converged, by world.
-            report: Where gradients are counted.
-        """
+        """Allocates buffers for steps of a solver that keeps contacts at their ends, and whose worlds ``converged``."""
         self.work, self.newton, self._converged, self.report = work, newton, converged, report
         self._model: Any = work.mesh.model
         model, self.equations = self._model, StepEquations(newton)
@@ -151,37 +144,31 @@ class StepGradients:
             self._places = None
 
     def record(self, place: Place, dt: float, start: StartArrays, end: StateArrays) -> RecordedStep:
-        """Returns a copy of a step that has been taken, before it ends for :class:`.LastStep`.
-
-        Args:
-            place: Its number on its tape, and its norms.
-            dt: Its length [s].
-            start: What of the state at its start no later step may change.
-            end: The state at its end.
-        """
+        """Returns a copy of a step that has been taken, before it ends for :class:`.LastStep`."""
         work, newton, model, device = self.work, self.newton, self._model, self.work.device
         motion, last, particles = work.motion.vertices, work.motion.last, model.particle_count
         x0, velocity = (wp.zeros(n, dtype=wp.vec3d, device=device) for n in (work.mesh.vertex_count, particles))
         work.launch(kernels.to_double, len(x0), [newton.problem.trial.origin], [x0])
         work.launch(kernels.to_double, particles, [start.particle_qd], [velocity])
-        is_fixed = wp.zeros(self.equations.count, dtype=int, device=device)
-        work.launch(kernels.find_fixed, len(is_fixed), [newton.problem.unknowns.is_free], [is_fixed])
+
+        def found(kernel, count, inputs):
+            values = wp.zeros(count, dtype=int, device=device)
+            work.launch(kernel, count, inputs, [values])
+            return values
+
+        is_fixed = found(kernels.find_fixed, self.equations.count, [newton.problem.unknowns.is_free])
         is_held = wp.zeros(particles, dtype=int, device=device)
         if self.equations.attachments is not None:
             at = self.equations.attachments
             inputs = [at.particle, at.stiffness, at.enabled, work.step.motion]
             work.launch(kernels.find_held, len(at.particle), inputs, [is_held])
-        failed = wp.zeros(work.worlds, dtype=int, device=device)
-        work.launch(kernels.begin_failed, work.worlds, [self._converged], [failed])
+        failed = found(kernels.begin_failed, work.worlds, [self._converged])
         inputs = [newton.problem.trial, newton.problem.unknowns, end.particle_q, work.mesh.device_world]
         work.launch(kernels.find_changed, particles, inputs, [failed])
-        of_particles = wp.zeros(particles, dtype=int, device=device)
-        inputs = [work.mesh.device_world, last.interrupted]
-        work.launch(kernels.find_continuing, particles, inputs, [of_particles])
+        of_particles = found(kernels.find_continuing, particles, [work.mesh.device_world, last.interrupted])
         of_bodies, poses, bodies = wp.zeros(model.body_count, dtype=int, device=device), (None, None), None
         if model.body_count:
-            inputs = [model.body_world, last.interrupted]
-            work.launch(kernels.find_continuing, model.body_count, inputs, [of_bodies])
+            of_bodies = found(kernels.find_continuing, model.body_count, [model.body_world, last.interrupted])
             is_solved = wp.zeros(model.body_count, dtype=int, device=device)
             if self.equations.of_bodies is not None:
                 inputs = [self.equations.of_bodies, is_fixed]
@@ -194,20 +181,9 @@ class StepGradients:
         if work.mesh.distance_arrays is not None:
             of_motion.distances = copied(motion.distances, ["radius", "of_planes"])
         of_motion.materials = copied_materials(motion.materials)
-        step = SolvedStep(
-            dt,
-            x0,
-            wp.clone(newton.problem.trial.exact),
-            velocity,
-            start.particle_f,
-            is_fixed,
-            *contacts,
-            of_motion,
-            copied(work.motion.planes, ["start", "end", "friction"]),
-            copied(newton.settings, ["load"]),
-            poses,
-            bodies,
-        )
+        start_and_end = x0, wp.clone(newton.problem.trial.exact), velocity, start.particle_f
+        planes, settings = copied(work.motion.planes, ["start", "end", "friction"]), copied(newton.settings, ["load"])
+        step = SolvedStep(dt, *start_and_end, is_fixed, *contacts, of_motion, planes, settings, poses, bodies)
         return RecordedStep(step, failed, of_particles, of_bodies, is_held, *place)
 
     def _predict(self, dt, start, poses, is_solved):
@@ -251,10 +227,7 @@ class StepGradients:
     def backward(self, recorded: RecordedStep, before: wp.array | None, of: StateGradients) -> None:
         """Turns gradients with respect to the end of a step into those with respect to all that it depends on.
 
-        Args:
-            recorded: The step.
-            before: The norms of the step of the same tape that ended where it begins, None if there is none.
-            of: The gradients of states, which are changed.
+        ``before`` are the norms of the step of the same tape that ended where it begins, None if there is none.
         """
         step, equations, model = recorded.step, self.equations, self._model
         particles, dt = model.particle_count, wp.float64(step.dt)
@@ -285,9 +258,8 @@ class StepGradients:
             poses = tuple(with_gradient(pose, of_pose) for pose, of_pose in zip(poses, of_poses, strict=True))
             wp.copy(of_poses[0], self._carried_poses)
             if of.end_body_q is not None:
-                self.work.launch(
-                    kernels.split_end_poses, model.body_count, [bodies.is_solved, of.end_body_q], [of_poses[0]]
-                )
+                inputs = [bodies.is_solved, of.end_body_q]
+                self.work.launch(kernels.split_end_poses, model.body_count, inputs, [of_poses[0]])
             if equations.of_bodies is not None:
                 motion.bodies, of_motion.bodies = with_gradients(step.motion.bodies, ["inverse_mass"])
                 of_goals = wp.zeros_like(bodies.goals), wp.zeros_like(bodies.goal_velocities)
@@ -309,9 +281,8 @@ class StepGradients:
                 inputs = self._inputs_of_goals(bodies, poses[1], step.dt, motion.bodies)
                 launch_adjoint(predict_goals, model.body_count, inputs, [*of_goals], self.work.device)
                 if model.body_inv_mass.grad is not None:
-                    self.work.launch(
-                        kernels.add_to, model.body_count, [of_motion.bodies.inverse_mass], [model.body_inv_mass.grad]
-                    )
+                    inputs = [of_motion.bodies.inverse_mass]
+                    self.work.launch(kernels.add_to, model.body_count, inputs, [model.body_inv_mass.grad])
             inputs = [recorded.of_bodies, bodies.is_solved, *of_poses]
             self.work.launch(kernels.finish_poses, model.body_count, inputs, [of.body_q, self._carried_poses])
         inputs = [dt, of.end_particle_qd, equations.unknown, step.is_fixed, recorded.is_held, recorded.of_particles]

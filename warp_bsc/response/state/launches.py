@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import warp as wp
 
+from ...detection.run.launch import cores_for, launch_on_cores
 from .mesh import ModelMesh
 from .structs import Step
 
@@ -22,13 +23,15 @@ class Launches:
         """Launches a kernel on the device."""
         wp.launch(kernel, size, inputs=inputs, outputs=outputs, device=self.device)
 
-    def launch_over_entries(self, kernel: wp.Kernel, inputs: Sequence) -> None:
+    def launch_over_entries(self, kernel: wp.Kernel, inputs: Sequence, on_cores: bool = False) -> None:
         """Launches a kernel that takes all entries of a queue, of which the device knows the number.
 
         Its last input is the number of its threads: each takes every so many-th entry, so that capacity that is not
-        used costs nothing. On the CPU it is one thread, because Warp's additions are not atomic there.
+        used costs nothing. On the CPU it is one thread, because Warp's additions are not atomic there, or eight for
+        each core for a kernel that runs ``on_cores``, see :func:`.launch_on_cores`.
         """
-        wp.launch(kernel, self._threads, inputs=[*inputs, self._threads], device=self.device)
+        threads = 8 * cores_for(kernel, self.device) if on_cores and self.device.is_cpu else self._threads
+        launch_on_cores(kernel, threads, inputs=[*inputs, threads], device=self.device)
 
     def launch_over_constraints(self, kernel: wp.Kernel, *inputs) -> None:
         """Launches a kernel that takes all constraints, with the step as its first input, as in all that follow."""

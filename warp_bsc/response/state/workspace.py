@@ -352,13 +352,9 @@ class Workspace(Launches):
         if self.worlds > 1:
             self.launch_over_constraints(list_constraints)
         threads = self.sweeping_threads
-        wp.launch(
-            kernel(max(1, threads // BLOCK)),
-            self.worlds * threads,
-            inputs=[self.step, self.particles, *inputs, threads],
-            device=self.device,
-            block_dim=min(threads, BLOCK),
-        )
+        inputs = [self.step, self.particles, *inputs, threads]
+        options = {"device": self.device, "block_dim": min(threads, BLOCK)}
+        wp.launch(kernel(max(1, threads // BLOCK)), self.worlds * threads, inputs=inputs, **options)
 
     def sweep(self, number: int, activate: Callable[[], None], project: wp.Kernel, update: Callable) -> None:
         """Sweeps a number of times over one active set, which ``activate`` fills, see :mod:`.solve.sweeps`.
