@@ -207,3 +207,30 @@ def test_worlds_on_several_cores_of_a_cpu_are_those_on_one(monkeypatch):
         for one, other in zip(ends[0], others, strict=True):
             for before, after in zip(one, other, strict=True):
                 assert all(np.array_equal(x, y) for x, y in zip(before, after, strict=True))
+
+
+def test_a_step_after_one_that_was_interrupted_is_as_if_that_had_not_been(monkeypatch):
+    run, other = Run(range(3), "cpu"), Run(range(3), "cpu")
+    launches = wp.Launch.launch
+
+    def step(of):
+        of.solver.step(*of.states, None, None, DT)
+
+    for last in (2, 6, 10, 14, 16, 18, 20):
+        taken = []
+
+        def launch_or_stop(command, last=last, taken=taken):
+            taken.append(command.kernel.key)
+            if taken.count("_advance") == last:
+                raise KeyboardInterrupt
+            launches(command)
+
+        with monkeypatch.context() as patch, launch.cores(2), pytest.raises(KeyboardInterrupt):
+            patch.setattr(wp.Launch, "launch", launch_or_stop)
+            step(run)
+        for each in (run, other):
+            step(each)
+            each.states.reverse()
+        for name in ARRAYS:
+            arrays = (getattr(each.states[0], name).numpy() for each in (run, other))
+            assert np.array_equal(*arrays)

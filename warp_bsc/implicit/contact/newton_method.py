@@ -337,15 +337,10 @@ class NewtonMethod:
         p.least_change = self._precision * self._least_speed * self._dt
         p.far_change = self._metre * _FAR_SPEED * self._dt
         p.max_steps, p.max_late_steps = self.max_steps, max(LATE_STEPS, self.max_steps)
-        progress, flow = p.progress, p.flow
-        for zeros in (
-            progress.active,
-            progress.given_moves,
-            progress.fastest,
-            flow.arrived,
-            flow.lacks,
-            self.iterations,
-        ):
+        flow, progress = p.flow, p.progress
+        lists = flow.count, flow.taken, flow.ended  # where an interrupt, of the last step, left them
+        of_worlds = progress.active, progress.given_moves, progress.fastest, flow.arrived, self.iterations
+        for zeros in (*of_worlds, *lists, flow.lacks):
             zeros.zero_()
         given = [motion, self.mesh.model.gravity, wp.float64(dt)]
         self._launch(steps.begin_unknowns, self._count, given, [p.unknowns, p.trial, p.progress])
