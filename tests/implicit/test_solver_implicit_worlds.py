@@ -194,15 +194,17 @@ def test_reset_worlds_start_anew_and_masked_ones_stand(together):
 
 def test_worlds_on_several_cores_of_a_cpu_are_those_on_one(monkeypatch):
     """More threads than cores too, so that they are interrupted anywhere."""
-    ends, used, pool = [], set(), launch.thread_pool
-    monkeypatch.setattr(launch, "thread_pool", lambda threads: used.add(threads) or pool(threads))
+    ends, taken, launches = [], [], wp.Launch.launch
+    monkeypatch.setattr(wp.Launch, "launch", lambda command: taken.append(command.kernel.key) or launches(command))
     for threads in (1, 2, 7):
+        taken.clear()
         with launch.cores(threads):
             run = Run(range(5), "cpu")
             for _ in range(STEPS):
                 run.step()
         ends.append(run.ends)
-    assert used >= {2, 7}
+        on_cores = {key.split("__")[-1] for key in taken} & {"_advance", "prepare_candidates", "solve_worlds"}
+        assert len(on_cores) == (3 if threads > 1 else 0)
     for others in ends[1:]:
         for one, other in zip(ends[0], others, strict=True):
             for before, after in zip(one, other, strict=True):

@@ -10,7 +10,8 @@ import warp as wp
 from warp_bsc.bench.timing import limited_threads
 from warp_bsc.detection.run import launch
 from warp_bsc.detection.run.launch import cores, count_cores, launch_on_cores, launch_over, thread_pool
-from warp_bsc.implicit.contact.team import add_to, lower_int_to
+from warp_bsc.implicit.contact.team import lower_int_to
+from warp_bsc.kernels.pipeline.queues import take_slot_int
 
 
 @wp.kernel
@@ -21,7 +22,7 @@ def add_one(first: int, values: wp.array[int]):
 
 @wp.kernel
 def take_number(taken: wp.array[int], values: wp.array[int], least: wp.array[int]):
-    number = add_to(taken, 0, 1)
+    number = take_slot_int(taken)
     values[number] = values[number] + 1
     lower_int_to(least, number % 3, -number)
 

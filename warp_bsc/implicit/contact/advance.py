@@ -10,10 +10,11 @@ written in the phase, as some threads may still be reading it.
 
 import warp as wp
 
+from ...kernels.pipeline.queues import take_slot_int, take_slot_of
 from . import assembly, bounds, contact_lists, decisions, held, merit, near, steps
 from .flow import Flow, Phase, Place, Problem
 from .system import end_of_contacts
-from .team import add_to, count_block, on_gpu, wait_for_team
+from .team import count_block, on_gpu, wait_for_team
 
 wp.set_module_options({"enable_backward": False})
 
@@ -113,7 +114,12 @@ def _leave(w: int, state: wp.vec4i, p: Problem):
         phase = int(Phase.DISPLACE)
         if p.flow.phase.shape[0] > 1:
             following = 1 - p.flow.turn[0]
-            p.flow.listed[following * p.flow.phase.shape[0] + add_to(p.flow.count, following, 1)] = w
+            place = following * p.flow.phase.shape[0]
+            if on_gpu() == 0:
+                place += take_slot_of(p.flow.count, following)
+            else:
+                place += wp.atomic_add(p.flow.count, following, 1)
+            p.flow.listed[place] = w
     elif phase == Phase.END:
         p.progress.leaves[w] = 0
     else:
@@ -171,7 +177,7 @@ def _advance(
     at.spread = _spread(at.thread, at.threads)
     number = block // together
     if on_gpu() == 0:
-        number = add_to(p.flow.taken, 0, 1)
+        number = take_slot_int(p.flow.taken)
     while number < count:
         w = number
         if of_all == 0:

@@ -12,9 +12,10 @@ import functools
 import warp as wp
 
 from ...kernels.native_text import header
+from ...kernels.pipeline.queues import take_slot_int
 from .matrix import Matrix
 from .system import Contacts, Unknowns
-from .team import add_to, on_gpu
+from .team import on_gpu
 
 _LARGEST_BLOCK = 1024
 """Threads of the only block of a world, at most."""
@@ -159,7 +160,7 @@ def _make_solve_kernel(bounds: int, parts: int, kept: int, shared: bool):
         """
         thread = wp.tid()
         if on_gpu() == 0:
-            thread = add_to(team.arrived, 0, 1)
+            thread = take_slot_int(team.arrived)
         number, lane = thread // wp.block_dim(), thread % wp.block_dim()
         world, block = number // team.blocks, number % team.blocks
         if thread == 0:

@@ -3,7 +3,7 @@
 import warp as wp
 
 from ...detection.narrow.rules.approach import KEPT, distances_of_pair
-from ...kernels.pipeline.queues import take_slot_of
+from ...kernels.pipeline.queues import take_slot_int, take_slot_of
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from ...response.contacts.collect import is_stopped_by_plane
 from ...response.contacts.queue import PairQueue, has_pair, pair_count, vertices_of
@@ -13,7 +13,7 @@ from ...response.state.structs import Motion, Step, body_of
 from ...response.state.vectors import HALF, ONE, ZERO, corners_of, to_double
 from . import barrier, distance_bounds
 from .system import Progress, key_of_pair
-from .team import add_to, lower_int_to, on_gpu
+from .team import lower_int_to, on_gpu
 
 wp.set_module_options({"enable_backward": False})
 
@@ -477,7 +477,7 @@ def prepare_candidates(
     begin, end, stride = wp.tid(), wp.max(pair_count(first), pair_count(second)), threads + int(0)
     if on_gpu() == 0:  # pairs of a world follow each other: a core has all of most worlds
         piece = (end + threads - 1) // threads
-        begin, stride = piece * add_to(candidates.used, 0, 1), 1
+        begin, stride = piece * take_slot_int(candidates.used), 1
         end = wp.min(end, begin + piece)
     for i in range(begin, end, stride):
         number = int(0)

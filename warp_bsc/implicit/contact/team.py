@@ -7,15 +7,6 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
-_ATOMIC = """
-#if defined(__CUDA_ARCH__)
-    return wp::atomic_{0}(values, i, value);
-#else
-    return __atomic_fetch_{0}(values.data + i, value, __ATOMIC_ACQ_REL);
-#endif
-"""
-"""What Warp does in one piece on a GPU alone, on a CPU as well."""
-
 
 @wp.func_native(snippet="\n#if defined(__CUDA_ARCH__)\n    return 1;\n#else\n    return 0;\n#endif\n")
 def on_gpu() -> int:
@@ -69,13 +60,15 @@ def count_block(values: wp.array[int]) -> int:
     ...
 
 
-@wp.func_native(snippet=_ATOMIC.format("add"))
-def add_to(values: wp.array[int], i: int, value: int) -> int:
-    """Adds to a number, and returns what it was."""
-    ...
-
-
-@wp.func_native(snippet=_ATOMIC.format("min"))
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    return wp::atomic_min(values, i, value);
+#else
+    return __atomic_fetch_min(values.data + i, value, __ATOMIC_ACQ_REL);
+#endif
+"""
+)
 def lower_int_to(values: wp.array[int], i: int, value: int) -> int:
-    """Lowers a number to another one, and returns what it was."""
+    """Lowers a number to another one, also on several cores of a CPU, and returns what it was."""
     ...
