@@ -202,7 +202,7 @@ def _nodes_to_visit(clusters: HierarchyLevel, cluster: int, box: BoxRows, level:
 
 
 @made_once
-def traversal_kernel(visit: Callable, arguments_type: type) -> wp.Kernel:
+def traversal_kernel(visit: Callable, arguments_type: type, **module_options: int) -> wp.Kernel:
     """Returns a kernel that visits the pairs of faces whose boxes no axis separates at both ends, each pair once.
 
     Its parameters are a :class:`FaceHierarchy`, the first cluster, the warps of a cluster and the arguments; launch it
@@ -211,12 +211,12 @@ def traversal_kernel(visit: Callable, arguments_type: type) -> wp.Kernel:
     Args:
         visit: Device function, ``visit(place: int, first: int, found: wp.uint32, arguments)``: the face at ``place``
             is paired with that at ``first + k`` for each bit k of ``found``. On a GPU all threads of a warp call it
-            together, each for its own face of one cluster, some of them with no bits. A thread may call it for many
-            ``first``, or for none.
+            together, each for its own face of one cluster, some with no bits; a thread for many ``first`` or none.
         arguments_type: Type of the last argument, a struct of Warp.
+        module_options: Options of the kernel's module.
     """
 
-    @wp.kernel(**NO_GRADIENTS)
+    @wp.kernel(**NO_GRADIENTS, module_options=module_options)
     def traverse(mesh: FaceHierarchy, first_cluster: int, warps_of_cluster: int, arguments: arguments_type):
         i = wp.tid()
         cluster = first_cluster + i / (WIDTH * warps_of_cluster)
