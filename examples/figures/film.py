@@ -51,7 +51,7 @@ def main(description, make, **inputs):
     Args:
         description: What the program does, whose first line is shown.
         make: Returns the :class:`Film`, given the paths of the inputs.
-        inputs: What each input file is, by its name on the command line.
+        inputs: What each input file is, by its name on the command line; an option, which may be None, has dashes.
     """
     parser = argparse.ArgumentParser(description=description.splitlines()[0])
     for name, text in inputs.items():
@@ -69,7 +69,7 @@ def main(description, make, **inputs):
     except OSError as error:
         parser.error(f"picture: {error}")
     try:
-        film = make(*[getattr(arguments, name) for name in inputs])
+        film = make(*[getattr(arguments, name.lstrip("-")) for name in inputs])
         chosen = range(film.frames)
         if path.suffix == ".png":
             chosen = arguments.frames or np.linspace(0, film.frames - 1, 5).round().astype(int).tolist()
