@@ -7,7 +7,7 @@ side, so that one box is compared with eight at once.
 - ``boxes``, float32, 96 a packet: for each axis the lowest and the highest coordinate at the start, then at the end.
 - ``elements``, int32, 48 a packet: the numbers of the elements, three corners each, their worlds, and their marks: 0
   of what has not changed, more than 1 of what is of a rigid body, by body.
-- ``nodes``, float32, 48 a node: for each axis the lowest and the highest coordinate of the children, at any time.
+- ``nodes``, float32, 96 a node: the same of its children.
 - ``node_marks``, int32, 24 a node: the first and the last world of the children, and whether elements below them have
   changed.
 

@@ -3,11 +3,12 @@
 typedef Scalar Four __attribute__((ext_vector_type(4)));
 typedef Scalar Loaded __attribute__((ext_vector_type(4), aligned(sizeof(Scalar))));
 typedef double Doubles __attribute__((ext_vector_type(4)));
+typedef float Row __attribute__((ext_vector_type(4)));
 
 const Scalar infinity = __builtin_inf();
 const int* element = elements.data + 48 * (size_t)packet;
 float* box = boxes.data + 96 * (size_t)packet;
-float* node = nodes.data + 48 * (size_t)(packet / 8) + packet % 8;
+float* node = nodes.data + 96 * (size_t)(packet / 8) + packet % 8;
 int* marks = node_marks.data + 24 * (size_t)(packet / 8) + packet % 8;
 
 // positions may be a view, with any stride; a fourth number is read with them where there is one
@@ -22,13 +23,17 @@ auto rounded = [](Four x, double pad) {
     const Doubles largest = 3.4028234663852886e38;
     const Doubles moved = __builtin_convertvector(x, Doubles) + pad;
     const Doubles clamped = __builtin_elementwise_max(__builtin_elementwise_min(moved, largest), -largest);
-    return __builtin_convertvector(clamped, float __attribute__((ext_vector_type(4))));
+    return __builtin_convertvector(clamped, Row);
 };
 
 float rows[12][8];
-for (int row = 0; row < 12; ++row)
-    for (int lane = 0; lane < 8; ++lane)
-        rows[row][lane] = row % 2 ? -__builtin_inff() : __builtin_inff();
+Row whole[4];
+for (int row = 0; row < 4; ++row) {
+    whole[row] = row % 2 ? -__builtin_inff() : __builtin_inff();
+    for (int axis = 0; axis < 3; ++axis)
+        for (int lane = 0; lane < 8; ++lane)
+            rows[4 * axis + row][lane] = whole[row][0];
+}
 int lane_marks[8] = {}, any_changed = 0;
 for (int lane = 0; lane < count; ++lane) {
     Four low0 = infinity, high0 = -infinity, low1 = infinity, high1 = -infinity;
@@ -52,24 +57,17 @@ for (int lane = 0; lane < count; ++lane) {
     any_changed |= mark != 0;
     if (!(finite[0] && finite[1] && finite[2]))
         continue;  // an empty box overlaps none
-    const auto a = rounded(low0, -pad), b = rounded(high0, pad), c = rounded(low1, -pad), d = rounded(high1, pad);
-    for (int axis = 0; axis < 3; ++axis) {
-        rows[4 * axis][lane] = a[axis];
-        rows[4 * axis + 1][lane] = b[axis];
-        rows[4 * axis + 2][lane] = c[axis];
-        rows[4 * axis + 3][lane] = d[axis];
+    const Row four[4] = {rounded(low0, -pad), rounded(high0, pad), rounded(low1, -pad), rounded(high1, pad)};
+    for (int row = 0; row < 4; ++row) {
+        whole[row] = row % 2 ? __builtin_elementwise_max(whole[row], four[row])
+                             : __builtin_elementwise_min(whole[row], four[row]);
+        for (int axis = 0; axis < 3; ++axis)
+            rows[4 * axis + row][lane] = four[row][axis];
     }
 }
-for (int axis = 0; axis < 3; ++axis) {
-    float low = __builtin_inff(), high = -__builtin_inff();
-    for (int lane = 0; lane < 8; ++lane)
-        for (int row = 4 * axis; row < 4 * axis + 4; row += 2) {
-            low = rows[row][lane] < low ? rows[row][lane] : low;
-            high = rows[row + 1][lane] > high ? rows[row + 1][lane] : high;
-        }
-    node[16 * axis] = low;
-    node[16 * axis + 8] = high;
-}
+for (int row = 0; row < 4; ++row)
+    for (int axis = 0; axis < 3; ++axis)
+        node[32 * axis + 8 * row] = whole[row][axis];
 __builtin_memcpy(box, rows, sizeof(rows));
 __builtin_memcpy(elements.data + 48 * (size_t)packet + 40, lane_marks, sizeof(lane_marks));
 marks[16] = any_changed;

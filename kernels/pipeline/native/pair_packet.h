@@ -11,26 +11,38 @@ auto bits = [](Ints mask) -> unsigned {
 };
 auto lowest = [](float a, float b) { return a < b ? a : b; };
 auto highest = [](float a, float b) { return a > b ? a : b; };
-
 const float* box = boxes.data + 96 * (size_t)packet;
 const int* element = elements.data + 48 * (size_t)packet;
+const bool separates = !keep_separated && !at_end;
 
-// the packet's own box, over all of the time, and its worlds, sorted as they are
-Floats lows[3], highs[3];
-float low[3], high[3], lane_lows[3][8], lane_highs[3][8];
-for (int axis = 0; axis < 3; ++axis) {
-    const float* at = box + 32 * axis;
-    lows[axis] = at_end ? floats(at + 16) : __builtin_elementwise_min(floats(at), floats(at + 16));
-    highs[axis] = at_end ? floats(at + 24) : __builtin_elementwise_max(floats(at + 8), floats(at + 24));
-    low[axis] = lows[axis][0];
-    high[axis] = highs[axis][0];
-    for (int lane = 1; lane < 8; ++lane) {
-        low[axis] = lowest(low[axis], lows[axis][lane]);
-        high[axis] = highest(high[axis], highs[axis][lane]);
+// which of the eight boxes in rows meet one, a lane of eight others
+auto meeting = [&](const float* eight, const float* one) -> Ints {
+    Ints apart = 0;
+    if (separates) {
+#pragma unroll
+        for (int i = 0; i < 96; i += 32) {
+            apart |= (floats(eight + i) > one[i + 8]) & (floats(eight + i + 16) > one[i + 24]);
+            apart |= (floats(eight + i + 8) < one[i]) & (floats(eight + i + 24) < one[i + 16]);
+        }
+        return ~apart;
     }
-    // a copy in memory: to take a lane whose number is not constant from a register stores all of it each time
-    __builtin_memcpy(lane_lows[axis], &lows[axis], sizeof(lane_lows[axis]));
-    __builtin_memcpy(lane_highs[axis], &highs[axis], sizeof(lane_highs[axis]));
+    for (int i = 0; i < 96; i += 32) {
+        const float *a = eight + i, *b = one + i, *start = at_end ? a + 16 : a, *other = at_end ? b + 16 : b;
+        apart |= __builtin_elementwise_min(floats(start), floats(a + 16)) > highest(other[8], b[24]);
+        apart |= __builtin_elementwise_max(floats(start + 8), floats(a + 24)) < lowest(other[0], b[16]);
+    }
+    return ~apart;
+};
+
+// the packet's own box, and its worlds, sorted as they are
+float whole[96];
+for (int row = 0; row < 12; ++row) {
+    whole[8 * row] = box[8 * row];
+    for (int lane = 1; lane < 8; ++lane) {
+        const float x = box[8 * row + lane];
+        if (row % 2 ? x > whole[8 * row] : x < whole[8 * row])
+            whole[8 * row] = x;
+    }
 }
 int first_world = element[32], last_world = element[32];
 for (int lane = 1; lane < 8; ++lane)
@@ -38,15 +50,15 @@ for (int lane = 1; lane < 8; ++lane)
 
 const int capacity = pairs.shape[0];
 constexpr int buffered = 512;
-int found[2 * buffered];
+int firsts[buffered], seconds[buffered];
 int count = 0;
 wp::int64 filtered = 0;
 auto flush = [&]() {
     const wp::int64 slot = __atomic_fetch_add(&counts.data[queued_count], (wp::int64)count, __ATOMIC_RELAXED);
     for (int i = 0; i < count && slot + i < capacity; ++i) {
         int* at = (int*)pairs.data + 2 * (size_t)(slot + i);
-        at[0] = found[2 * i];
-        at[1] = found[2 * i + 1];
+        at[0] = firsts[i];
+        at[1] = seconds[i];
     }
     count = 0;
 };
@@ -69,51 +81,19 @@ auto compare = [&](int other, unsigned lanes) {
     const unsigned other_changed = bits(ints(other_element + 40) != 0);
     if (!other_changed)
         lanes &= changed;
-    if (!lanes)
-        return;
-    Floats other_low0[3], other_high0[3], other_low1[3], other_high1[3], other_low[3], other_high[3];
-    for (int axis = 0; axis < 3; ++axis) {
-        const float* at = other_box + 32 * axis;
-        other_low0[axis] = floats(at);
-        other_high0[axis] = floats(at + 8);
-        other_low1[axis] = floats(at + 16);
-        other_high1[axis] = floats(at + 24);
-        other_low[axis] = at_end ? other_low1[axis] : __builtin_elementwise_min(other_low0[axis], other_low1[axis]);
-        other_high[axis] = at_end ? other_high1[axis] : __builtin_elementwise_max(other_high0[axis], other_high1[axis]);
-    }
     for (; lanes; lanes &= lanes - 1) {
-        const int lane = __builtin_ctz(lanes);
-        Ints overlap = ints(other_element + 32) == element[32 + lane];
-        const int mark = element[40 + lane];
+        const int lane = __builtin_ctz(lanes), mark = element[40 + lane];
+        Ints met = meeting(other_box, box + lane) & (ints(other_element + 32) == element[32 + lane]);
         if (mark > 1)
-            overlap &= ints(other_element + 40) != mark;
-        for (int axis = 0; axis < 3; ++axis)
-            overlap &= (other_low[axis] <= lane_highs[axis][lane]) & (other_high[axis] >= lane_lows[axis][lane]);
-        unsigned mask = bits(overlap);
+            met &= ints(other_element + 40) != mark;
+        for (int i = 0; i < corners; ++i)
+            for (int j = 0; j < other_corners; ++j)
+                met &= ints(other_element + 8 + 8 * j) != element[8 + 8 * i + lane];
+        unsigned mask = bits(met);
         if (!mark)
             mask &= other_changed;
         if (symmetric && other == packet)
             mask &= ~((2u << lane) - 1u);
-        if (!mask)
-            continue;
-        Ints shared = 0;
-        for (int i = 0; i < corners; ++i)
-            for (int j = 0; j < other_corners; ++j)
-                shared |= ints(other_element + 8 + 8 * j) == element[8 + 8 * i + lane];
-        mask &= ~bits(shared);
-        if (!mask)
-            continue;
-        if (!keep_separated && !at_end) {
-            Ints apart = 0;
-            for (int axis = 0; axis < 3; ++axis) {
-                const float* at = box + 32 * axis + lane;
-                apart |= (other_low0[axis] > at[8]) & (other_low1[axis] > at[24]);
-                apart |= (other_high0[axis] < at[0]) & (other_high1[axis] < at[16]);
-            }
-            mask &= ~bits(apart);
-            if (!mask)
-                continue;
-        }
         if (group.data) {
             unsigned left_out = 0;
             for (unsigned rest = mask; rest; rest &= rest - 1) {
@@ -130,12 +110,19 @@ auto compare = [&](int other, unsigned lanes) {
         }
         if (count > buffered - 8)
             flush();
-        for (; mask; mask &= mask - 1) {
-            const int a = element[lane], b = other_element[__builtin_ctz(mask)];
-            found[2 * count] = ordered && b < a ? b : a;
-            found[2 * count + 1] = ordered && b < a ? a : b;
-            ++count;
+        const Ints a = element[lane], b = ints(other_element);
+        const Ints smaller = ordered ? __builtin_elementwise_min(a, b) : a;
+        const Ints larger = ordered ? __builtin_elementwise_max(a, b) : b;
+#ifdef __AVX512VL__  // without a branch, as how many pairs there are is hard to predict
+        *(Ints*)(firsts + count) = __builtin_ia32_compresssi256_mask(smaller, smaller, mask);
+        *(Ints*)(seconds + count) = __builtin_ia32_compresssi256_mask(larger, larger, mask);
+        count += __builtin_popcount(mask);
+#else
+        for (; mask; mask &= mask - 1, ++count) {
+            firsts[count] = smaller[__builtin_ctz(mask)];
+            seconds[count] = larger[__builtin_ctz(mask)];
         }
+#endif
     }
 };
 
@@ -147,13 +134,12 @@ int height = 0;
 stack[height++] = {level_starts.shape[0] - 2, 0};
 while (height > 0) {
     const int level = stack[--height].level, node = stack[height].node;
-    const float* child = other_nodes.data + 48 * (size_t)(level_starts.data[level] + node);
+    const float* child = other_nodes.data + 96 * (size_t)(level_starts.data[level] + node);
     const int* child_marks = other_node_marks.data + 24 * (size_t)(level_starts.data[level] + node);
     Ints overlap = (ints(child_marks) <= last_world) & (ints(child_marks + 8) >= first_world);
     if (!changed)
         overlap &= ints(child_marks + 16) != 0;
-    for (int axis = 0; axis < 3; ++axis)
-        overlap &= (floats(child + 16 * axis) <= high[axis]) & (floats(child + 16 * axis + 8) >= low[axis]);
+    overlap &= meeting(child, whole);
     for (unsigned mask = bits(overlap); mask; mask &= mask - 1) {
         const int lane = __builtin_ctz(mask);
         const wp::int64 index = 8 * (wp::int64)node + lane;
@@ -164,10 +150,7 @@ while (height > 0) {
             stack[height++] = {level - 1, (int)index};
             continue;
         }
-        Ints near_child = -1;
-        for (int axis = 0; axis < 3; ++axis)
-            near_child &= (lows[axis] <= child[16 * axis + 8 + lane]) & (highs[axis] >= child[16 * axis + lane]);
-        compare((int)index, bits(near_child));
+        compare((int)index, bits(meeting(box, child + lane)));
     }
 }
 if (count)

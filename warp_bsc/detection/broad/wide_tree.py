@@ -199,14 +199,14 @@ def _join_nodes(
     node = start + i
     parent = above + i / 8
     lane = i % 8
-    for axis in range(3):
+    for row in range(6):
         low = wp.float32(wp.inf)
         high = wp.float32(-wp.inf)
         for child in range(8):
-            low = wp.min(low, nodes[node, 2 * axis, child])
-            high = wp.max(high, nodes[node, 2 * axis + 1, child])
-        nodes[parent, 2 * axis, lane] = low
-        nodes[parent, 2 * axis + 1, lane] = high
+            low = wp.min(low, nodes[node, 2 * row, child])
+            high = wp.max(high, nodes[node, 2 * row + 1, child])
+        nodes[parent, 2 * row, lane] = low
+        nodes[parent, 2 * row + 1, lane] = high
     last = int(-1)
     changed = int(0)
     for child in range(8):
@@ -260,7 +260,7 @@ class WideTree:
         empty = np.array([np.inf, -np.inf], dtype=np.float32).reshape(1, 2, 1)
         self._boxes = wp.array(np.tile(empty, (packets, 6, 8)), dtype=wp.float32, device=device)
         self._elements = wp.full((packets, 48), -1, dtype=int, device=device)
-        self._nodes = wp.array(np.tile(empty, (starts[-1], 3, 8)), dtype=wp.float32, device=device)
+        self._nodes = wp.array(np.tile(empty, (starts[-1], 6, 8)), dtype=wp.float32, device=device)
         self._node_marks = wp.full((starts[-1], 3, 8), -1, dtype=int, device=device)
         self._tree = tree = _Tree()
         tree.corners, tree.level_starts = corners.shape[1], wp.array(starts, dtype=int, device=device)
@@ -292,17 +292,15 @@ class WideTree:
         self._sorted_size, self.is_sorted = 0.0, True
 
     def fit(self, x0: wp.array, x1: wp.array, changed: wp.array | None = None) -> None:
-        """Computes the boxes of all packets and nodes for a motion, without sorting.
-
-        Arguments are those of :meth:`.BroadPhaseHierarchy.pair_elements`.
-        """
+        """Fits packets and nodes to a motion; arguments as of :meth:`.BroadPhaseHierarchy.pair_elements`."""
         _, fit_packets = _kernels(x0.dtype)
         inputs, device = [x0, x1, len(self._corners), changed, self._padding], self._corners.device
         launch_over(fit_packets, len(self._boxes), inputs=inputs, outputs=[self._tree], device=device, chunk=2048)
-        nodes, starts = self._nodes.numpy(), self._tree.level_starts.numpy().tolist()
+        starts = self._tree.level_starts.numpy().tolist()
+        rows = self._nodes.numpy()[: starts[1]].reshape(-1, 3, 4, 8)
         with np.errstate(over="ignore"):
-            sizes = nodes[: starts[1], 1::2] - nodes[: starts[1], 0::2]
-        self._size = float(sizes.sum(where=np.isfinite(sizes), dtype=np.float64))
+            sizes = np.maximum(rows[:, :, 1], rows[:, :, 3]) - np.minimum(rows[:, :, 0], rows[:, :, 2])
+        self._size = float(np.clip(sizes, 0.0, np.finfo(np.float32).max).sum(dtype=np.float64))
         self._sorted_size = self._sorted_size or self._size
         for start, above in itertools.pairwise(starts[:-1]):
             inputs, outputs = [start, above], [self._nodes, self._node_marks]
