@@ -1,9 +1,8 @@
 """The culls of many pairs at once, by SIMD instructions of a CPU.
 
-The box test compares one pair at a time, all coordinates of both ends in one vector. The other culls test the remaining
-pairs in SIMD packets of eight: they consist of the same additions, multiplications and comparisons for every pair.
-The operations are those of :mod:`warp_bsc.kernels.culling` and :mod:`warp_bsc.kernels.polynomials`, in the same order,
-and the bounds on their errors are the same.
+The box test compares one pair at a time, all coordinates of both ends in one vector. The other culls test eight of the
+remaining pairs at once, by the operations of :mod:`warp_bsc.kernels.culling` and :mod:`warp_bsc.kernels.polynomials` in
+the same order, with the same bounds on their errors.
 
 Pairs are not scaled: scaling by powers of two affects overflow and underflow alone. Overflow does not occur, because
 pairs with vectors of 1e70 or more are culled by boxes only. Underflow changes each of at most four products of a
@@ -43,8 +42,8 @@ def cull_batch_of(dtype: type, vertex_face: bool) -> wp.Function:
 
     Returns:
         Device function for the CPU. Its arguments are the positions at both ends, the vertices of the elements, a queue
-        of pairs, the first pair of the batch, the number of pairs in it, at most :data:`BATCH`, and the roundoff. It
-        returns a bit for each pair, set where no cull decides the pair. Indices are not checked.
+        of pairs, the first of the batch, their number, at most :data:`BATCH`, whether boxes are known to meet, and the
+        roundoff. It returns a bit for each pair, set where no cull decides it. Indices are not checked.
     """
     snippet = native_for_pairs(
         dtype,
@@ -68,6 +67,7 @@ def cull_batch_of(dtype: type, vertex_face: bool) -> wp.Function:
         pairs: wp.array[wp.vec2i],
         first: int,
         count: int,
+        boxes_meet: bool,
         # rounding
         roundoff: wp.float64,
     ) -> wp.uint64: ...

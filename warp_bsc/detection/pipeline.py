@@ -279,7 +279,8 @@ class DetectionPipeline:
             options = {"tolerance": self.tolerance, "arcs": self._arcs, "timer": timer}
             run_approaches(narrow_phases, x0, x1, self._min_distances, proximities=proximities, **options)
         elif self.device_radius is None:
-            run_contacts(narrow_phases, x0, x1, arcs=self._arcs, **options)
+            boxes_meet = self._arcs is None and not (keep_separated or queued)
+            run_contacts(narrow_phases, x0, x1, arcs=self._arcs, boxes_meet=boxes_meet, **options)
             if self._arcs is not None:
                 run_arcs(narrow_phases, x0, x1, self._arcs, timer=timer)
         else:

@@ -4,6 +4,11 @@
 int near[batch];
 int near_count = 0;
 for (int i = 0; i < count; ++i) {
+    near[near_count] = i;
+    if (boxes_meet) {
+        ++near_count;
+        continue;
+    }
     int corner[4];
     corners_of(first + i, corner);
     auto later = [](int a, int b) { return a > b ? a : b; };
@@ -21,7 +26,6 @@ for (int i = 0; i < count; ++i) {
     }
     const int above = bits(other_low > high), below = bits(low > other_high);
     const int apart = ((above & (above >> 4)) | (below & (below >> 4))) & 7;
-    near[near_count] = i;
     near_count += apart == 0;
 }
 

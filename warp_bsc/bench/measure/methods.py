@@ -134,7 +134,7 @@ def _kernels(kind: PairKind, dtype: type):
     def cull_batches(first: int, given: MeshPairs, survivors: wp.array[int], survivor_count: wp.array[wp.int64]):
         i = BATCH * (first + wp.tid())
         count = wp.min(BATCH, given.pairs.shape[0] - i)
-        left = cull_batch(given.x0, given.x1, given.elements, given.pairs, i, count, wp.float64(0.0))
+        left = cull_batch(given.x0, given.x1, given.elements, given.pairs, i, count, False, wp.float64(0.0))
         while left != wp.uint64(0):
             survivors[wp.int32(take_slot(survivor_count, 0))] = i + lowest_bit(left)
             left = left & (left - wp.uint64(1))

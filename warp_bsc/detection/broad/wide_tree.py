@@ -275,10 +275,7 @@ class WideTree:
         return self._size > _LOOSE * self._sorted_size
 
     def sort(self, x0: wp.array, x1: wp.array, low: np.ndarray, scale: np.ndarray) -> None:
-        """Sorts the elements along a Hilbert curve of the grid of a motion, as of :meth:`fit`.
-
-        The grid has its lowest corner at ``low``, and ``scale`` cells per unit of length along each axis.
-        """
+        """Sorts the elements along a Hilbert curve of a grid from ``low`` on, with ``scale`` cells to a unit."""
         encode, _ = _kernels(x0.dtype)
         n, device = len(self._corners), self._corners.device
         inputs = [x0, x1, self._corners, self._worlds, wp.vec3d(low), wp.vec3d(scale)]
@@ -318,8 +315,6 @@ class WideTree:
         filtered_of_worlds: wp.array | None = None,
     ) -> None:
         """Enqueues the candidates between this tree and another, or within this tree.
-
-        See :func:`warp_bsc.kernels.pipeline.wide_bvh.pair_packet`.
 
         Args:
             other: The other tree, or this tree.

@@ -62,6 +62,7 @@ def batch_culling_kernel(kind: PairKind, dtype: type, on_arcs: bool) -> wp.Kerne
         x0: wp.array[dtype],
         x1: wp.array[dtype],
         roundoff: wp.float64,
+        boxes_meet: bool,
         arcs: Arcs,
         # in and out
         buffers: PairBuffers,
@@ -73,7 +74,7 @@ def batch_culling_kernel(kind: PairKind, dtype: type, on_arcs: bool) -> wp.Kerne
         if wp.static(on_arcs):
             if any_turns(arcs):
                 straight = _move_turning_pairs(kind_number, buffers, arcs, i, count)
-        left = cull_batch(x0, x1, buffers.elements, buffers.queue, i, straight, roundoff)
+        left = cull_batch(x0, x1, buffers.elements, buffers.queue, i, straight, boxes_meet, roundoff)
         slot = take_slots(buffers.counts, Count.SURVIVORS, count_bits(left))
         while left != wp.uint64(0):
             write(buffers.queue[i + lowest_bit(left)], buffers.survivors, slot)

@@ -155,6 +155,7 @@ def run_contacts(
     timed: bool = True,
     tolerance: float = TOLERANCE,
     arcs: "Arcs | None" = None,
+    boxes_meet: bool = False,
     timer: PhaseTimer,
 ) -> None:
     """Launches all phases but the sorting over the queued pairs of both kinds, or of one.
@@ -170,6 +171,7 @@ def run_contacts(
         timed: Whether to find times of impact, coordinates and normals.
         tolerance: Of the times of impact, as a share of the step.
         arcs: Pairs with a turning vertex are left out, for :mod:`.arc`; None if nothing turns.
+        boxes_meet: Whether no axis separates the unpadded boxes of any pair at both ends, in single precision.
         timer: Measures the phases.
     """
     options = Options()
@@ -189,7 +191,8 @@ def run_contacts(
     with timer.phase("cull"):
         if is_cpu:
             cull = functools.partial(batch_culling_kernel, on_arcs=arcs is not None)
-            launch_batches(cull, [Arcs() if arcs is None else arcs], "queue", Count.QUEUED, CULLED)
+            others = [boxes_meet and x0.dtype is wp.vec3, Arcs() if arcs is None else arcs]
+            launch_batches(cull, others, "queue", Count.QUEUED, CULLED)
         else:
             launch_culls(_RULE, buffers, x0, x1, options)
     with timer.phase("classify"):
