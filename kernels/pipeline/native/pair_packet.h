@@ -9,41 +9,38 @@ auto ints = [](const int* at) { return *(const Ints*)at; };
 auto bits = [](Ints mask) -> unsigned {
     return __builtin_bit_cast(unsigned char, __builtin_convertvector(mask, Bools));
 };
-auto lowest = [](float a, float b) { return a < b ? a : b; };
-auto highest = [](float a, float b) { return a > b ? a : b; };
 const float* box = boxes.data + 96 * (size_t)packet;
 const int* element = elements.data + 48 * (size_t)packet;
-const bool separates = !keep_separated && !at_end;
 
-// which of the eight boxes in rows meet one, a lane of eight others
+// the packet's boxes, with keep_separated those over all of the time for each end, and the box around them
+float own[96], whole[96];
+#pragma unroll
+for (int row = 0; row < 12; ++row) {
+    auto outer = [&](Floats a, Floats b) {
+        return row % 2 ? __builtin_elementwise_max(a, b) : __builtin_elementwise_min(a, b);
+    };
+    Floats rows = floats(box + 8 * row);
+    if (keep_separated && !at_end)
+        rows = outer(rows, floats(box + 8 * (row ^ 2)));
+    *(Floats*)(own + 8 * row) = rows;
+    rows = outer(rows, __builtin_shufflevector(rows, rows, 4, 5, 6, 7, 0, 1, 2, 3));
+    rows = outer(rows, __builtin_shufflevector(rows, rows, 2, 3, 0, 1, 6, 7, 4, 5));
+    whole[8 * row] = outer(rows, __builtin_shufflevector(rows, rows, 1, 0, 3, 2, 5, 4, 7, 6))[0];
+}
+
+// which of the eight boxes in rows no axis separates at both ends from one, a lane of eight others
+const int start = at_end ? 16 : 0;
 auto meeting = [&](const float* eight, const float* one) -> Ints {
     Ints apart = 0;
-    if (separates) {
 #pragma unroll
-        for (int i = 0; i < 96; i += 32) {
-            apart |= (floats(eight + i) > one[i + 8]) & (floats(eight + i + 16) > one[i + 24]);
-            apart |= (floats(eight + i + 8) < one[i]) & (floats(eight + i + 24) < one[i + 16]);
-        }
-        return ~apart;
-    }
     for (int i = 0; i < 96; i += 32) {
-        const float *a = eight + i, *b = one + i, *start = at_end ? a + 16 : a, *other = at_end ? b + 16 : b;
-        apart |= __builtin_elementwise_min(floats(start), floats(a + 16)) > highest(other[8], b[24]);
-        apart |= __builtin_elementwise_max(floats(start + 8), floats(a + 24)) < lowest(other[0], b[16]);
+        apart |= (floats(eight + i + start) > one[i + start + 8]) & (floats(eight + i + 16) > one[i + 24]);
+        apart |= (floats(eight + i + start + 8) < one[i + start]) & (floats(eight + i + 24) < one[i + 16]);
     }
     return ~apart;
 };
 
-// the packet's own box, and its worlds, sorted as they are
-float whole[96];
-for (int row = 0; row < 12; ++row) {
-    whole[8 * row] = box[8 * row];
-    for (int lane = 1; lane < 8; ++lane) {
-        const float x = box[8 * row + lane];
-        if (row % 2 ? x > whole[8 * row] : x < whole[8 * row])
-            whole[8 * row] = x;
-    }
-}
+// its worlds, sorted as they are
 int first_world = element[32], last_world = element[32];
 for (int lane = 1; lane < 8; ++lane)
     last_world = element[32 + lane] > last_world ? element[32 + lane] : last_world;
@@ -83,7 +80,7 @@ auto compare = [&](int other, unsigned lanes) {
         lanes &= changed;
     for (; lanes; lanes &= lanes - 1) {
         const int lane = __builtin_ctz(lanes), mark = element[40 + lane];
-        Ints met = meeting(other_box, box + lane) & (ints(other_element + 32) == element[32 + lane]);
+        Ints met = meeting(other_box, own + lane) & (ints(other_element + 32) == element[32 + lane]);
         if (mark > 1)
             met &= ints(other_element + 40) != mark;
         for (int i = 0; i < corners; ++i)
@@ -150,7 +147,7 @@ while (height > 0) {
             stack[height++] = {level - 1, (int)index};
             continue;
         }
-        compare((int)index, bits(meeting(box, child + lane)));
+        compare((int)index, bits(meeting(own, child + lane)));
     }
 }
 if (count)

@@ -48,11 +48,12 @@ def kernels_of(kind, dtype):
         x1: wp.array[dtype],
         elements: wp.array2d[int],
         pairs: wp.array[wp.vec2i],
+        boxes_meet: bool,
         roundoff: wp.float64,
         left: wp.array[int],
     ):
         i = BATCH * wp.tid()
-        bits = cull_batch(x0, x1, elements, pairs, i, wp.min(BATCH, pairs.shape[0] - i), roundoff)
+        bits = cull_batch(x0, x1, elements, pairs, i, wp.min(BATCH, pairs.shape[0] - i), boxes_meet, roundoff)
         while bits != wp.uint64(0):
             left[i + lowest_bit(bits)] = 1
             bits = bits & (bits - wp.uint64(1))
@@ -73,6 +74,10 @@ def test_culls_are_those_of_one_query(kind, dtype):
         alone, together = cull(kind, scaled, roundoff)
         assert np.array_equal(alone, together)
         assert 0.2 < together.mean() < 0.95
+        _, without_boxes = cull(kind, scaled, roundoff, boxes_meet=True)
+        meet = boxes_meet(kind, scaled)
+        assert (without_boxes & ~meet).any()  # what only boxes cull
+        assert np.array_equal(without_boxes & meet, together)
     for points in (scaled, extreme):
         _, left = cull(kind, points, float(ROUNDOFF))
         culled = np.flatnonzero(~left)[:: 1 if points is scaled else 4]
@@ -80,15 +85,24 @@ def test_culls_are_those_of_one_query(kind, dtype):
         assert not getattr(checker, kind)(points[culled]).any()
 
 
-def cull(kind, points, roundoff):
-    """What the culls leave, one by one and eight at once."""
+def boxes_meet(kind, points):
+    """Whether no axis separates the boxes of the two elements at both ends."""
+    ends = points.reshape(-1, 2, 4, 3)
+    one, other = np.split(ends, [1 if kind == "vertex_face" else 2], axis=2)
+    above = (one.min(axis=2) > other.max(axis=2)).all(axis=1)
+    below = (one.max(axis=2) < other.min(axis=2)).all(axis=1)
+    return ~(above | below).any(axis=1)
+
+
+def cull(kind, points, roundoff, boxes_meet=False):
+    """What the culls leave, one by one and eight at once, the latter without a look at boxes that are said to meet."""
     queries = QuerySet(Queries.of_points(PairKind[kind.upper()], points), "cpu")
     alone, together = (wp.zeros(queries.count + BATCH, dtype=int, device="cpu") for _ in range(2))
     one, eight = kernels_of(kind, queries.dtype)
     given = queries.given
     x0, x1, elements, pairs = given.x0, given.x1, given.elements, given.pairs
     wp.launch(one, queries.count, inputs=[x0, x1, roundoff], outputs=[alone], device="cpu")
-    inputs = [x0, x1, elements, pairs, roundoff]
+    inputs = [x0, x1, elements, pairs, boxes_meet, roundoff]
     wp.launch(eight, -(-queries.count // BATCH), inputs=inputs, outputs=[together], device="cpu")
     assert not together.numpy()[queries.count :].any()
     return alone.numpy()[: queries.count] == 1, together.numpy()[: queries.count] == 1
