@@ -8,7 +8,6 @@ the second one needs: Blender as a Python module (``pip install bpy``, Python 3.
 """
 
 import argparse
-import json
 import sys
 import time
 from pathlib import Path
@@ -22,7 +21,9 @@ from newton.examples.cloth.example_cloth_franka import Example
 from rich.progress import track
 
 import warp_bsc as bsc
+from warp_bsc.bench.crossings import SoftPairs
 from warp_bsc.bench.measure.newton_examples import STAGE_TOTALS
+from warp_bsc.response.state.mesh import ModelMesh
 
 sys.path.append(str(Path(__file__).parent))  # for the studio
 import film
@@ -102,33 +103,12 @@ class FoldImplicit(Fold):
 _RUNS = {"vbd": Fold, "implicit": FoldImplicit}
 
 
-class Crossings:
-    """Counts edges of the shirt that cross its faces, and crossings of the shirt with robot and table."""
-
-    def __init__(self, model):
-        self.mesh = bsc.CollisionMonitor(newton.solvers.SolverXPBD(model)).mesh  # shirt, robot and table
-        self._detector, self._particles = bsc.CollisionDetector(self.mesh), model.particle_count
-        self._positions = wp.empty(self.mesh.vertex_count, dtype=wp.vec3, device=model.device)
-
-    def positions(self, state):
-        """Returns positions of the vertices of shirt, robot and table, shape [n, 3]."""
-        self.mesh.positions(state.particle_q, state.body_q, self._positions)
-        return self._positions.numpy()
-
-    def find(self, state):
-        """Returns the edges of the shirt that cross its faces, shape [n, 2], and the number of the others."""
-        self.mesh.positions(state.particle_q, state.body_q, self._positions)
-        found = self._detector.find_intersections(self._positions)
-        edges, faces = self.mesh.edges[found[:, 0]], self.mesh.faces[found[:, 1]]
-        of_edge, of_face = (edges < self._particles).all(axis=1), (faces < self._particles).all(axis=1)
-        return edges[of_edge & of_face], int((of_edge ^ of_face).sum())
-
-
 def record(name, folder, frames):
     """Steps a run, writes what is recorded of it to a file, and prints time and crossings."""
     example = _RUNS[name]()
-    crossings = Crossings(example.model)
-    states, bodies, edges, others, seconds = [], [], [], [], []
+    mesh, particles = ModelMesh(example.model), example.model.particle_count  # shirt, robot and table
+    pairs, x = SoftPairs(mesh, particles), wp.empty(mesh.vertex_count, dtype=wp.vec3, device=example.model.device)
+    states, bodies, counts, seconds = [], [], [], []
     for frame in track(range(frames + 1), f"Recording {name}"):
         if frame:
             start = time.perf_counter()
@@ -138,24 +118,13 @@ def record(name, folder, frames):
         if frame % _EVERY == 0:
             states.append(example.state_0.particle_q.numpy().copy())
             bodies.append(example.state_0.body_q.numpy().copy())
-            found, other = crossings.find(example.state_0)
-            edges.append(found)
-            others.append(other)
-    counts = [len(found) for found in edges]
-    totals = example.totals()
+            mesh.positions(example.state_0.particle_q, example.state_0.body_q, x)
+            counts.append(pairs.count_crossings(x))
     folder.mkdir(parents=True, exist_ok=True)
-    np.savez_compressed(
-        folder / f"{name}.npz",
-        states=states,
-        bodies=bodies,
-        edges=np.concatenate(edges),
-        counts=counts,
-        others=others,
-        seconds=seconds,
-        totals=json.dumps(totals),
-    )
-    most = {"edges through faces": max(counts), "crossings with robot and table": max(others)}
-    print(name, {"ms a frame": round(1e3 * float(np.mean(seconds[1:])), 1), **most, **totals})
+    np.savez_compressed(folder / f"{name}.npz", states=states, bodies=bodies, seconds=seconds)
+    found, rigid = np.transpose(counts)
+    most = {"edges through faces": int((found - rigid).max()), "crossings with robot and table": int(rigid.max())}
+    print(name, {"ms a frame": round(1e3 * float(np.mean(seconds[1:])), 1), **most, **example.totals()})
 
 
 def make(folder, assets=None):
@@ -163,12 +132,14 @@ def make(folder, assets=None):
     use_assets(assets)
     with wp.ScopedDevice("cpu"):
         example = Fold()
-        crossings = Crossings(example.model)
-    mesh, particles, state = crossings.mesh, example.model.particle_count, example.state_0
+    mesh, particles, state = ModelMesh(example.model), example.model.particle_count, example.state_0
+    positions = wp.empty(mesh.vertex_count, dtype=wp.vec3, device="cpu")
     runs = {title: dict(np.load(Path(folder) / f"{name}.npz")) for name, title in _TITLES.items()}
     is_shirt = mesh.faces[:, 0] < particles
     shirt, rigid = mesh.faces[is_shirt], mesh.faces[~is_shirt] - particles
-    corners = crossings.positions(state)[shirt]
+    corners = state.particle_q.numpy()[shirt]
+    fabric = bsc.CollisionMesh(shirt, particles, device="cpu")
+    detector = bsc.CollisionDetector(fabric)
     is_back = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, 2] < 0.0
     body = mesh.shape_vertices.body[rigid[:, 0]]
     is_table = mesh.shape_vertices.shape[rigid[:, 0]] == mesh.shape_vertices.shape.max()
@@ -179,22 +150,22 @@ def make(folder, assets=None):
     robot = studio.add("robot", rigid, tints, sheen=0.0, smooth=False)
 
     def shoot(run, i):
-        """Returns the picture of a recorded state, with red dots where edges cross faces."""
+        """Returns the picture of a recorded state, with red dots where edges cross faces, and the number of these."""
         state.particle_q.assign(run["states"][i])
         state.body_q.assign(run["bodies"][i])
-        x = 0.01 * crossings.positions(state)
+        mesh.positions(state.particle_q, state.body_q, positions)
+        x = 0.01 * positions.numpy()
         studio.move(cloth, x[:particles])
         studio.move(robot, x[particles:])
         picture = studio.shoot()
-        first = run["counts"][:i].sum()
-        edges = run["edges"][first : first + run["counts"][i]]
-        film.dots(picture, studio.pixels(x[edges].mean(axis=1)), film.RED, 3.0)
-        return picture
+        crossing = detector.find_intersections(state.particle_q)[:, 0]
+        film.dots(picture, studio.pixels(x[fabric.edges[crossing]].mean(axis=1)), film.RED, 3.0)
+        return picture, len(crossing)
 
     def draw(number):
         i = _FIRST + number
-        pictures = [shoot(run, i) for run in runs.values()]
-        titles = [f"{title}\n{run['counts'][i]} edges through faces" for title, run in runs.items()]
+        pictures, counts = zip(*[shoot(run, i) for run in runs.values()], strict=True)
+        titles = [f"{title}\n{count} edges through faces" for title, count in zip(runs, counts, strict=True)]
         return film.beside(pictures, titles, f"{i * _EVERY / 60:.1f} s", band=66)
 
     frames = min(len(run["states"]) for run in runs.values()) - _FIRST

@@ -9,6 +9,7 @@ auto ints = [](const int* at) { return *(const Ints*)at; };
 auto bits = [](Ints mask) -> unsigned {
     return __builtin_bit_cast(unsigned char, __builtin_convertvector(mask, Bools));
 };
+
 const float* box = boxes.data + 96 * (size_t)packet;
 const int* element = elements.data + 48 * (size_t)packet;
 

@@ -199,7 +199,7 @@ def _join_nodes(
     node = start + i
     parent = above + i / 8
     lane = i % 8
-    for row in range(6):
+    for row in range(6):  # low and high of an axis at one end
         low = wp.float32(wp.inf)
         high = wp.float32(-wp.inf)
         for child in range(8):
