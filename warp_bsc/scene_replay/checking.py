@@ -1,9 +1,10 @@
 """Checks the intervals of a scene in one process, as a pipeline of three phases.
 
-While the results of one interval are named, the next one is detected (on a CPU) and the one after it is read.
+While the results of some intervals are named, the next one is detected and the one after it is read.
 """
 
 import math
+import threading
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -12,6 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from .._one_thread import one_at_a_time
 from ..detection.arcs.rigid_motion import RigidMotion
 from ..detection.at_rest.containment import ContainmentFinder
 from ..detection.at_rest.intersections import Intersections
@@ -32,11 +34,14 @@ from .scene_arcs import arcs_of
 from .scene_contacts import compare_contacts, find_contacts, join_contacts
 from .scene_intersections import name_intersections
 from .scene_proximities import name_proximities
-from .threads import read_ahead
+from .threads import map_ahead, read_ahead
 from .validation import validate
 
 FACES_AT_ONCE = 30_000
 """Most faces of all copies of a segment, one for each interval that is detected at once; a copy counts 500 more."""
+
+_NAMING_THREADS = 4
+"""Threads that name detected pairs, which NumPy does mostly without Python's lock."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +76,7 @@ class IntervalChecker:
         self._of_segment: tuple[_SegmentDetector, _SegmentNamer] | None = None
 
     def check(self, first: int, stop: int, seconds: float = math.inf) -> Iterator[IntervalResult]:
-        """Yields the results of some intervals, in order. Threads meanwhile read the next ones, and detect on a CPU.
+        """Yields the results of some intervals, in order. Threads meanwhile read and detect the next ones.
 
         Args:
             first: Number of the first interval.
@@ -84,12 +89,8 @@ class IntervalChecker:
         detections = self._detect(first, stop, time.monotonic() + seconds)
         if is_cpu(self._checks.device):
             detections = read_ahead(detections)
-        for works, namer, detection in detections:
-            started = time.perf_counter()
-            results = namer.name(detection)
-            share = (time.perf_counter() - started) / len(results)
-            for work, result in zip(works, results, strict=True):
-                yield replace(result, work=replace(work, checking=work.checking + share))
+        for results in map_ahead(_named, detections, _NAMING_THREADS):
+            yield from results
 
     def selection_without_initial(self) -> Selection:
         """Returns the selection that also ignores the pairs that cross, or are inside each other, at the first time."""
@@ -127,6 +128,16 @@ class IntervalChecker:
             detector = _SegmentDetector(interval.segment, self._checks)
             self._of_segment = detector, _SegmentNamer(interval.segment, detector, self._checks)
         return self._of_segment
+
+
+def _named(found: tuple[list[Work], "_SegmentNamer", "_Detection"]) -> list[IntervalResult]:
+    """Returns the results of intervals, with the work on them."""
+    works, namer, detection = found
+    started = time.perf_counter()
+    results = namer.name(detection)
+    share = (time.perf_counter() - started) / len(results)
+    pairs = zip(works, results, strict=True)
+    return [replace(result, work=replace(work, checking=work.checking + share)) for work, result in pairs]
 
 
 @dataclass(eq=False)
@@ -281,6 +292,7 @@ class _SegmentNamer:
     def __init__(self, segment: Segment, detector: _SegmentDetector, checks: Checks):
         self.segment = segment
         self._checks = checks
+        self._lock = threading.RLock()
         self._mesh = detector.mesh
         self._strand_mesh = detector.strands.mesh if detector.strands else None
         bodies = detector.strands.bodies if detector.strands else segment.face_meshes
@@ -335,6 +347,7 @@ class _SegmentNamer:
             results.append(IntervalResult(summary, found, at_rest[number], near[number], None))
         return results
 
+    @one_at_a_time
     def name_at(self, moments: Iterable[_Moment]) -> None:
         """Names the intersections, with the parts inside meshes, and the proximities of some times, once."""
         selection, meshes = self._checks.selection, self.segment.meshes

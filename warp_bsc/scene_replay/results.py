@@ -210,7 +210,7 @@ class Work:
     Attributes:
         worker: Name of the process; empty for the one that writes the results.
         device: Name of the Warp device that it used.
-        reading: Time to read the scene's samples [s]; another interval may be checked meanwhile.
+        reading: Time to read the scene's samples [s]. Other intervals may be read and checked meanwhile.
         checking: Time to check them [s].
     """
 

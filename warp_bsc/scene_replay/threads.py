@@ -1,11 +1,15 @@
-"""Iterators that work one item ahead, and calls that run one item behind, in threads."""
+"""Iterators that work ahead, and calls that run behind, in threads."""
 
 import contextvars
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Generic, TypeVar
 
 _Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
+
+_MOST_WAITING = 16  # calls that run behind: the first ones of a replay take seconds, the others next to nothing
 
 
 def read_ahead(items: Iterable[_Item]) -> Iterator[_Item]:
@@ -32,35 +36,78 @@ def read_ahead(items: Iterable[_Item]) -> Iterator[_Item]:
             yield taken.pop()
 
 
+def map_ahead(function: Callable[[_Item], _Result], items: Iterable[_Item], threads: int) -> Iterator[_Result]:
+    """Yields ``function(item)`` for each item, in order, and meanwhile calls it for the next ones in other threads.
+
+    Items are taken in this thread, as soon as a call can begin. Closing the iterator waits for the calls that run.
+
+    Args:
+        function: The function; its calls run in this thread's context.
+        items: The items.
+        threads: Number of calls at a time.
+
+    Raises:
+        Exception: The error of an item or of its call, when that item is next.
+    """
+    iterator = iter(items)
+    calls: deque[Future[_Result]] = deque()
+    end: Exception | None = None
+    with ThreadPoolExecutor(threads, thread_name_prefix="map-ahead") as pool:
+        while True:
+            while end is None and len(calls) < threads:
+                try:
+                    calls.append(pool.submit(contextvars.copy_context().run, function, next(iterator)))
+                except Exception as error:  # also that of the last item: StopIteration
+                    end = error
+            if not calls:
+                break
+            yield calls.popleft().result()
+    if not isinstance(end, StopIteration):
+        raise end
+
+
 class WriteBehind(Generic[_Item]):
-    """Calls a function with items in order in another thread, with at most one item waiting."""
+    """Calls a function with items in order in another thread, with at most :data:`_MOST_WAITING` items waiting."""
 
     def __init__(self, write: Callable[[_Item], None]):
         """Makes a queue without items for calls of ``write``."""
         self._write = write
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="write-behind")
-        self._pending: Future[None] | None = None
+        self._calls: deque[Future[None]] = deque()
+        self._has_failed = False
 
     def put(self, item: _Item) -> None:
-        """Waits until the previous item is written, and hands over the next one.
+        """Hands over the next item, as soon as there is room for it.
 
         Raises:
-            Exception: The error of the call with the previous item.
+            Exception: The error of a call, after which there are no others.
         """
-        self.wait()
-        self._pending = self._pool.submit(self._write, item)
+        while self._calls and (len(self._calls) == _MOST_WAITING or self._calls[0].done()):
+            self._wait_for_first()
+        self._calls.append(self._pool.submit(self._call, item))
 
     def wait(self) -> None:
-        """Waits until every item is written. An interruption ends the wait, not the call.
+        """Waits until every item is written. An interruption ends the wait, not the calls.
 
         Raises:
-            Exception: The error of the last call, once.
+            Exception: The error of a call, once.
         """
-        if self._pending:
-            self._pending.exception()
-            pending, self._pending = self._pending, None
-            pending.result()
+        while self._calls:
+            self._wait_for_first()
 
     def close(self) -> None:
         """Ends the thread after the last call."""
         self._pool.shutdown()
+
+    def _call(self, item: _Item) -> None:
+        if self._has_failed:
+            return
+        try:
+            self._write(item)
+        except BaseException:
+            self._has_failed = True
+            raise
+
+    def _wait_for_first(self) -> None:
+        self._calls[0].exception()
+        self._calls.popleft().result()
