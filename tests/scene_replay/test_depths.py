@@ -56,7 +56,7 @@ def test_depths_of_large_scenes_are_measured_where_more_crosses(tmp_path, monkey
     recorder, measured, find = DepthRecorder(), [], DepthFinder.find
     monkeypatch.setattr(DepthFinder, "find", lambda own, found: measured.append(found.time) or find(own, found))
     for result in bsc.replay(bsc.Scene(save(stage)), device="cpu"):
-        recorder.add(result)
+        recorder.add(result.intersections)
     assert recorder.largest() == {("/World/Ball", "/World/Sheet"): (pytest.approx(1.0, abs=1e-5), 1.0)}
     assert measured == times
 

@@ -160,7 +160,8 @@ def _report(path: str, frames: Frames, selection: Selection, device: str) -> Non
         with naming(path):
             for result in tracked(scene, "Replaying", device):
                 page.add(result)
-                depths.add(result)
+                if result.intersections:
+                    depths.add(result.intersections)
                 intervals.append(result.summary)
             found = {"intervals": intervals, "depths": depths.largest()}
             page.finish(Summary(scene, method="exact", device=device, clearance=None, **found))

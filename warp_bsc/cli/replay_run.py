@@ -29,6 +29,9 @@ from .replay_options import command_of, repair_command_of
 from .replay_tables import print_new, print_repair, print_replay, print_work
 from .tables import Console, say
 
+_MOST_TO_MEASURE = 64
+"""Times that may wait for the depths of the first ones, which take seconds, of later ones next to nothing."""
+
 
 class ReplayRun(contextlib.ExitStack):
     """Replays a scene into the files that the options name; those that are not finished go when it is closed.
@@ -57,6 +60,7 @@ class ReplayRun(contextlib.ExitStack):
         self._works: list[Work | None] = []
         self._writing = 0.0
         self._depths = DepthRecorder()
+        self._measured = WriteBehind(self._depths.add, _MOST_TO_MEASURE)
         self._outputs: list[ReplayOutput] = []
         try:
             self._earlier = find_earlier(arguments.json, facts) if arguments.resume else None
@@ -95,6 +99,7 @@ class ReplayRun(contextlib.ExitStack):
             KeyboardInterrupt: If a signal stopped it, after the files are written.
         """
         written = self.enter_context(contextlib.closing(WriteBehind(self._write)))
+        self.enter_context(contextlib.closing(self._measured))
         with INTERRUPTS.held():
             self._find(written)
             stopped = f"stopped by an error: {self.problems[0]}" if self.problems else str(self.interrupt or "")
@@ -126,11 +131,12 @@ class ReplayRun(contextlib.ExitStack):
         except Exception as error:
             self.interrupt = INTERRUPTS.came  # a library may have turned it into another error
             self.problems += [] if self.interrupt else [self._explain(error)]
-        try:
-            written.wait()
-        except Exception as error:
-            problem = self._explain(error)  # readers and writers all find a change of the scene's files
-            self.problems += [] if self.interrupt or problem in self.problems else [problem]
+        for behind in (written, self._measured):
+            try:
+                behind.wait()
+            except Exception as error:
+                problem = self._explain(error)  # readers and writers all find a change of the scene's files
+                self.problems += [] if self.interrupt or problem in self.problems else [problem]
 
     def _track(self) -> Generator[IntervalResult, None, None]:
         """Yields the intervals of an earlier replay, then the others as they are found, and shows the progress."""
@@ -156,7 +162,8 @@ class ReplayRun(contextlib.ExitStack):
         """Writes an interval to all files."""
         started = time.perf_counter()
         self._scene.files.check()
-        self._depths.add(result)
+        if result.intersections:
+            self._measured.put(result.intersections)
         if self._arguments.limit:
             result = limit_rows(result, self._arguments.limit)
         for output in self._outputs:

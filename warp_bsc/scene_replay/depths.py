@@ -19,7 +19,6 @@ import numpy as np
 from ..detection.at_rest.body_parts import connect_cells
 from ..detection.at_rest.closest_points import ClosestPointFinder
 from ..usd.segment import Segment
-from .results import IntervalResult
 from .scene_intersections import SceneIntersections
 
 _ON_SIDE = 1e-5  # barycentric coordinate up to which the closest point of a face is on a side of it
@@ -99,11 +98,10 @@ class DepthRecorder:
         self._last: SceneIntersections | None = None  # at the end of the last interval
         self._work, self._most = 0, 0
 
-    def add(self, result: IntervalResult) -> None:
+    def add(self, intersections: tuple[SceneIntersections, SceneIntersections]) -> None:
         """Measures the depths at the start of an interval, which follows the last one that was added."""
-        if result.intersections:
-            start, self._last = result.intersections
-            self._measure(start)
+        start, self._last = intersections
+        self._measure(start)
 
     def largest(self) -> dict[tuple[str, str], tuple[float, float]]:
         """Returns the largest depth of each two meshes, and the first time with it, by their sorted names."""

@@ -9,8 +9,6 @@ from typing import Generic, TypeVar
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
-_MOST_WAITING = 16  # calls that run behind: the first ones of a replay take seconds, the others next to nothing
-
 
 def read_ahead(items: Iterable[_Item]) -> Iterator[_Item]:
     """Yields items, and meanwhile makes the next one in another thread, in this thread's context.
@@ -67,11 +65,11 @@ def map_ahead(function: Callable[[_Item], _Result], items: Iterable[_Item], thre
 
 
 class WriteBehind(Generic[_Item]):
-    """Calls a function with items in order in another thread, with at most :data:`_MOST_WAITING` items waiting."""
+    """Calls a function with items in order in another thread."""
 
-    def __init__(self, write: Callable[[_Item], None]):
-        """Makes a queue without items for calls of ``write``."""
-        self._write = write
+    def __init__(self, write: Callable[[_Item], None], most: int = 16):
+        """Makes a queue without items for calls of ``write``, in which at most so many wait."""
+        self._write, self._most = write, most
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="write-behind")
         self._calls: deque[Future[None]] = deque()
         self._has_failed = False
@@ -82,7 +80,7 @@ class WriteBehind(Generic[_Item]):
         Raises:
             Exception: The error of a call, after which there are no others.
         """
-        while self._calls and (len(self._calls) == _MOST_WAITING or self._calls[0].done()):
+        while self._calls and (len(self._calls) == self._most or self._calls[0].done()):
             self._wait_for_first()
         self._calls.append(self._pool.submit(self._call, item))
 
