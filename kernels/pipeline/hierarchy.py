@@ -112,43 +112,122 @@ def count_set_bits(bits: wp.uint32) -> int:
     ...
 
 
+_ABOVE = wp.constant(wp.uint32((1 << 9) | (1 << 19) | (1 << 29)))
+"""The bits above three coordinates of 9 bits."""
+
+
 @wp.struct
 class HierarchyLevel:
     """The nodes of one level: faces by place, clusters or bundles.
 
     Attributes:
-        boxes: Box of each node, shape [n, 4], with lowest coordinates higher than the highest where there is no face.
-        changed: Nonzero where a face has pairs that are sought.
+        boxes: Box of each node, shape [n, 4], with lowest coordinates higher than the highest where there is no face;
+            no array for faces, whose boxes are :attr:`coded`.
+        changed: Nonzero where a face has pairs that are sought; no array likewise.
+        coded: Box of each face in that of its cluster, see :func:`coded_box`, shape [n, 4]; no array for other levels.
         first_world: Lowest world of the faces below; no array if all faces are in one world.
         last_world: Highest world of the faces below.
     """
 
     boxes: wp.array2d[wp.vec3]
     changed: wp.array[int]
+    coded: wp.array2d[wp.uint32]
     first_world: wp.array[int]
     last_world: wp.array[int]
 
 
 @wp.func
-def fit_parent(child: int, box: BoxRows, changed: int, parents: HierarchyLevel):
-    """Writes the box of the parent of a child, from the boxes of all 32 children, one a thread."""
+def is_idle(child: int) -> bool:
+    """Returns whether a thread has nothing to do for its child: on the CPU, where that of the first does it all."""
+    return child_step() == 1 and child % WIDTH != 0
+
+
+@wp.func
+def write_node(level: HierarchyLevel, node: int, box: BoxRows, changed: int):
+    """Writes a node, from what the threads of a warp know of its children, and returns its box."""
     low0 = _min_of_warp(box[0])
     high0 = -_min_of_warp(-box[1])
     low1 = _min_of_warp(box[2])
     high1 = -_min_of_warp(-box[3])
+    of_node = wp.matrix_from_rows(low0, high0, low1, high1)
     any_changed = _any_of_warp(changed)
-    parent = child / WIDTH
-    if child % WIDTH != 0:
-        if child_step() != 1:
-            return
-        before = read_box(parents.boxes, parent)
-        low0 = wp.min(low0, before[0])
-        high0 = wp.max(high0, before[1])
-        low1 = wp.min(low1, before[2])
-        high1 = wp.max(high1, before[3])
-        any_changed = any_changed | parents.changed[parent]
-    write_box(wp.matrix_from_rows(low0, high0, low1, high1), parents.boxes, parent)
-    parents.changed[parent] = any_changed
+    if first_child() == 0:
+        write_box(of_node, level.boxes, node)
+        level.changed[node] = any_changed
+    return of_node
+
+
+@wp.func_native(
+    snippet="""
+    wp::vec_t<4, wp::uint32> coded;
+    for (int row = 0; row < 4; ++row) {
+        wp::uint32 word = 0;
+        for (int axis = 0; axis < 3; ++axis) {
+            const float low = node.data[row & 2][axis], extent = node.data[row | 1][axis] - low;
+#if defined(__CUDA_ARCH__)
+            float scale = __fdividef(509.0f, extent);
+#else
+            float scale = 509.0f / extent;
+#endif
+            const float steps = (box.data[row][axis] - low) * wp::min(wp::max(scale, 1.0e-38f), 3.0e38f);
+            word |= (wp::uint32)(wp::min(wp::max(steps, -1.0f), 510.0f) + 1.0f) << 10 * axis;
+        }
+        coded[row] = word;
+    }
+    return coded;
+"""
+)
+def coded_box(box: BoxRows, node: BoxRows) -> wp.vec4ui:
+    """Returns a box in that of a node: each coordinate in 9 bits, with a free one above them, a row in one number.
+
+    Coordinates become numbers in [0, 511] by the same function, which keeps their order, however it is rounded: where
+    two of them differ, in this order, so do the coordinates.
+    """
+    ...
+
+
+@wp.func
+def _are_less(a: wp.uint32, b: wp.uint32) -> wp.uint32:
+    """Returns which of three coordinates are less than others, as bits above them; two more bits may be anything."""
+    return ~((a | _ABOVE) - b) & _ABOVE
+
+
+@wp.func
+def codes_apart(a: wp.vec4ui, b: wp.vec4ui) -> bool:
+    """Returns whether an axis separates two boxes as :func:`are_apart` does, if that shows in the box of a node."""
+    below = _are_less(a[1], b[0]) & _are_less(a[3], b[2])
+    above = _are_less(b[1], a[0]) & _are_less(b[3], a[2])
+    return (below | above) != wp.uint32(0)
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    for (int row = 0; row < 4; ++row)
+        coded[row] = __shfl_sync(0xffffffffu, coded[row], child);
+#endif
+    return coded;
+"""
+)
+def code_of_child(coded: wp.vec4ui, child: int) -> wp.vec4ui:
+    """Returns what the thread of a child has; on the CPU what this thread has."""
+    ...
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    const uint4 row = reinterpret_cast<const uint4*>(rows.data)[i];
+    return wp::vec_t<4, wp::uint32>(row.x, row.y, row.z, row.w);
+#else
+    const wp::uint32* row = rows.data + 4 * (size_t)i;
+    return wp::vec_t<4, wp::uint32>(row[0], row[1], row[2], row[3]);
+#endif
+"""
+)
+def read_coded(rows: wp.array2d[wp.uint32], i: int) -> wp.vec4ui:
+    """Returns a row of an array of coded boxes, which is contiguous and begins at a multiple of 16 bytes."""
+    ...
 
 
 @wp.func
@@ -183,49 +262,6 @@ def unseparated_children(clusters: HierarchyLevel, cluster: int, box: BoxRows, l
 
 
 @wp.func
-def changed_children(level: HierarchyLevel, first: int):
-    """Returns which of 32 nodes of a level, from the first on, have changed, as bits."""
-    found = wp.uint32(0)
-    count = wp.min(WIDTH, level.boxes.shape[0] - first)
-    for child in range(first_child(), count, child_step()):
-        if level.changed[first + child] != 0:
-            found = found | (wp.uint32(1) << wp.uint32(child))
-    return union_of_warp(found)
-
-
-@wp.func
 def bits_from(first: int):
     """Returns the bits from one on, in [0, 31]."""
     return ~((wp.uint32(1) << wp.uint32(first)) - wp.uint32(1))
-
-
-@wp.func
-def unseparated_faces(
-    faces: HierarchyLevel, place: int, box: BoxRows, first: int, candidates: wp.uint32, changed: wp.uint32
-):
-    """Returns which faces of a cluster no axis separates from a face at a place, as bits, each pair of faces once.
-
-    Args:
-        faces: The level of faces.
-        place: Place of the face.
-        box: Its box.
-        first: First place of the cluster, which is that of the face or a later one.
-        candidates: Places of the cluster to test, the same for all threads of a warp.
-        changed: Places of the cluster whose faces have changed.
-    """
-    sought = candidates
-    if faces.changed[place] == 0:
-        sought = sought & changed
-    if first <= place:
-        own = wp.uint32(1) << wp.uint32(place - first)
-        sought = sought & ~(own | (own - wp.uint32(1)))
-    found = wp.uint32(0)
-    left = candidates
-    while left != wp.uint32(0):
-        bit = left & (~left + wp.uint32(1))
-        left = left ^ bit
-        other = first + lowest_set_bit(bit)
-        if not are_apart(box, read_box(faces.boxes, other)):
-            if (sought & bit) != wp.uint32(0) and same_world(faces, place, faces, other):
-                found = found | bit
-    return found

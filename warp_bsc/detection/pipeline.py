@@ -133,8 +133,8 @@ class DetectionPipeline:
                 counted too if they are not finite.
             pairs: Pairs that fit into both queues at first, a quarter of them of vertices and faces, and at least
                 :data:`MIN_CAPACITY` into each; twice as many pairs of faces, a half of them survivors, an eighth
-                contacts. A large capacity costs memory, but no time. Default: for each face, eight pairs of faces of a
-                part of the mesh, one vertex-face and two edge-edge pairs.
+                contacts (of many millions half of that). A large capacity costs memory, but no time. Default: for two
+                faces, sixteen pairs of faces of a part of the mesh, one vertex-face and four edge-edge pairs.
 
         Raises:
             ValueError: If the method is unknown, or the tolerance, the distance or the rings are out of range.
@@ -174,7 +174,7 @@ class DetectionPipeline:
             padding = arcs.deviation if self._padding is None else wp.empty_like(self._padding)
         self._padding_on_arcs = padding
         elements = faces + len(mesh.free_edges) + len(mesh.points)
-        face_pairs, vertex_face, edge_edge = None, elements, 2 * elements
+        face_pairs, vertex_face, edge_edge = None, elements // 2 + 1, 2 * elements
         if pairs is not None:
             # of sheets that lie on each other, three of four pairs are of edges, and most pairs of faces have none
             sizes = [min(max(n * pairs // 4, MIN_CAPACITY), 2**31 - 1) for n in (1, 3, 8)]

@@ -153,7 +153,8 @@ class BroadPhaseHierarchy:
         if not self.is_padded or self._not_finite is not None:
             inputs, outputs = [x0, x1, self._checked], [None if self.is_padded else tree.corners, self._not_finite]
             launch(round_kernel(x0.dtype), self._vertex_count, inputs=inputs, outputs=outputs, **options)
-        inputs = [x0, x1, changed, self._padding, keep_separated, tree]
+        tree.swept = keep_separated
+        inputs = [x0, x1, changed, self._padding, tree]
         launch(fit_kernel(x0.dtype, self.is_padded), len(tree.order), inputs=inputs, **options)
         for children, parents in ((tree.clusters, tree.bundles), (tree.bundles, tree.groups)):
             if parents.boxes is not None:
@@ -195,7 +196,7 @@ class BroadPhaseHierarchy:
             count = self._part_counts[part : part + 1] if parts > 1 else self._count
             ends = [self._clusters * i // parts for i in (part, part + 1)]
             pairs = _queue_of(count, self.face_pairs)
-            self.traverse(traversal_kernel(_enqueue_faces, Pairs), pairs, *ends)
+            self.traverse(traversal_kernel(_enqueue_faces, Pairs, self.is_padded), pairs, *ends)
             for make_kernel, out in launches:
                 queues = [_queue_of(*queue) for queue in zip(out[::2], out[1::2], strict=True)]
                 kernel = make_kernel(self.is_padded, keep_separated)

@@ -1,19 +1,21 @@
 """A hierarchy of boxes over the faces of a mesh, and its traversal on a GPU.
 
 The hierarchy is made once, from the connectivity of the mesh, see :mod:`.face_order`: patches of connected faces stay
-compact however a mesh moves. A run only fits its boxes. Edges that no face has and points have places as well, as faces
-that have collapsed: the cells of the mesh are its faces, then these edges, then the points. Cells without neighbours
-are in no order, and in the worst case are compared by brute force, 1,024 pairs of cells at a time.
+compact however a mesh moves. A run only fits its boxes; those of faces are coded in the boxes of their clusters, in 16
+bytes. Edges that no face has and points have places as well, as faces that have collapsed: the cells of the mesh are its
+faces, then these edges, then the points. Cells without neighbours are in no order, and in the worst case are compared by
+brute force, 1,024 pairs of cells at a time.
 
 Each node has 32 children: faces, clusters, bundles, and groups, all of which a traversal tests with each cluster.
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import warp as wp
 
-from ...kernels.boxes import BoxRows, empty_box, read_box, rounded, union_of_boxes, write_box
+from ...kernels.boxes import BoxRows, empty_box, read_box, rounded, union_of_boxes
 from ...kernels.pairs import PairFilter
 from ...kernels.pipeline.corners import (
     PADDED_ROW,
@@ -22,6 +24,7 @@ from ...kernels.pipeline.corners import (
     corner_is_finite,
     read_cell,
     read_corners,
+    read_padded_corners,
     vertex_box,
     with_padded_corner,
     write_padded_corners,
@@ -31,11 +34,18 @@ from ...kernels.pipeline.hierarchy import (
     WIDTH,
     HierarchyLevel,
     bits_from,
-    changed_children,
-    fit_parent,
+    child_step,
+    code_of_child,
+    coded_box,
+    codes_apart,
+    first_child,
+    is_idle,
     lowest_set_bit,
+    read_coded,
+    same_world,
+    union_of_warp,
     unseparated_children,
-    unseparated_faces,
+    write_node,
 )
 from ...kernels.pipeline.queues import raise_count
 from ..mesh import CollisionMesh
@@ -44,6 +54,9 @@ from ..run.settings import NO_GRADIENTS
 
 FEW_NODES = 8
 """Nodes of a level above the clusters up to which all are traversed: their boxes would take longer than they save."""
+
+_CHANGED, _COVERS = wp.constant(wp.uint32(1 << 30)), wp.constant(wp.uint32(1 << 31))
+"""Bits of the first number of a coded box: whether pairs of the face are sought, and whether it has what is finite."""
 
 
 @wp.struct
@@ -64,6 +77,7 @@ class FaceHierarchy:
         face_edges: Edges of the face at each place.
         edges: Vertices of each edge.
         corners: Rows of vertices, or with a padding those of the cell at each place.
+        swept: Whether boxes are those over the time of the motion.
         places: Level of the faces; where a position is not finite, boxes cover the others.
         clusters: Level above.
         bundles: Level above the clusters; without arrays in a small mesh, where all are traversed.
@@ -80,6 +94,7 @@ class FaceHierarchy:
     face_edges: wp.array2d[int]
     edges: wp.array2d[int]
     corners: wp.array2d[wp.float32]
+    swept: wp.bool
     places: HierarchyLevel
     clusters: HierarchyLevel
     bundles: HierarchyLevel
@@ -116,6 +131,27 @@ def round_kernel(dtype: type) -> wp.Kernel:
     return round_positions
 
 
+@wp.func
+def _box_of_finite(corners: Any, swept: bool) -> BoxRows:
+    """Returns the box of the corners of a cell that are finite."""
+    box = empty_box()
+    for j in range(3):
+        if corner_is_finite(corners, j):
+            box = union_of_boxes(box, vertex_box(corners, j, swept))
+    return box
+
+
+@wp.func
+def _is_sought(mesh: FaceHierarchy, changed: wp.array[int], i: int) -> bool:
+    """Returns whether pairs of the cell at a place are sought."""
+    if mesh.order[i] < 0 or (mesh.only_free and mesh.order[i] < mesh.face_count):
+        return False
+    cell = read_cell(mesh.faces, i)
+    if changed:
+        return (changed[cell[0]] | changed[cell[1]] | changed[cell[2]]) != 0
+    return True
+
+
 @made_once
 def fit_kernel(dtype: type, padded: bool) -> wp.Kernel:
     """Returns the kernel that writes the boxes of faces and clusters, and with a padding the rows of the cells.
@@ -126,23 +162,20 @@ def fit_kernel(dtype: type, padded: bool) -> wp.Kernel:
     """
 
     @wp.func
-    def corners_of(
-        x0: wp.array[dtype],
-        x1: wp.array[dtype],
-        padding: wp.array[wp.float64],
-        mesh: FaceHierarchy,
-        i: int,
-        cell: wp.vec4i,
-    ):
+    def box_at(x0: wp.array[dtype], x1: wp.array[dtype], padding: wp.array[wp.float64], mesh: FaceHierarchy, i: int):
+        """Returns the box of what is finite at a place."""
+        if mesh.order[i] < 0:
+            return empty_box()
+        cell = read_cell(mesh.faces, i)
         if wp.static(not padded):
-            return read_corners(mesh.corners, cell)
+            return _box_of_finite(read_corners(mesh.corners, cell), mesh.swept)
         else:
             pad = wp.max(wp.max(padding[cell[0]], padding[cell[1]]), padding[cell[2]])
             corners = PaddedCorners()
             for j in range(3):
                 corners = with_padded_corner(corners, j, x0[cell[j]], x1[cell[j]], pad)
             write_padded_corners(mesh.corners, i, corners)
-            return corners
+            return _box_of_finite(corners, mesh.swept)
 
     @wp.kernel(**NO_GRADIENTS)
     def fit(
@@ -151,27 +184,32 @@ def fit_kernel(dtype: type, padded: bool) -> wp.Kernel:
         x1: wp.array[dtype],
         changed: wp.array[int],
         padding: wp.array[wp.float64],
-        swept: bool,
         # in and out
         mesh: FaceHierarchy,
     ):
         i = wp.tid()
+        if is_idle(i):
+            return
+        first = i - i % WIDTH
         box = empty_box()
-        has_changed = int(0)
-        if mesh.order[i] >= 0:
-            cell = read_cell(mesh.faces, i)
-            corners = corners_of(x0, x1, padding, mesh, i, cell)
-            for j in range(3):
-                if corner_is_finite(corners, j):  # the place covers what is finite
-                    box = union_of_boxes(box, vertex_box(corners, j, swept))
-            has_changed = 1
-            if changed:
-                has_changed = changed[cell[0]] | changed[cell[1]] | changed[cell[2]]
-            if mesh.only_free and mesh.order[i] < mesh.face_count:
-                has_changed = 0
-        write_box(box, mesh.places.boxes, i)
-        mesh.places.changed[i] = has_changed
-        fit_parent(i, box, has_changed, mesh.clusters)
+        united = empty_box()
+        any_sought = int(0)
+        for place in range(first + first_child(), first + WIDTH, child_step()):
+            box = box_at(x0, x1, padding, mesh, place)
+            united = union_of_boxes(united, box)
+            if _is_sought(mesh, changed, place):
+                any_sought = 1
+        cluster_box = write_node(mesh.clusters, i / WIDTH, united, any_sought)
+        for place in range(first + first_child(), first + WIDTH, child_step()):
+            if child_step() == 1:
+                box = box_at(x0, x1, padding, mesh, place)
+            coded = coded_box(box, cluster_box)
+            if box[0][0] <= box[1][0]:
+                coded[0] = coded[0] | _COVERS
+            if _is_sought(mesh, changed, place):
+                coded[0] = coded[0] | _CHANGED
+            for row in range(4):
+                mesh.places.coded[place, row] = coded[row]
 
     return fit
 
@@ -185,12 +223,15 @@ def box_parents(
 ):
     """Boxes bundles or groups."""
     i = wp.tid()
+    if is_idle(i):
+        return
     box = empty_box()
-    has_changed = int(0)
-    if i < children.boxes.shape[0]:
-        box = read_box(children.boxes, i)
-        has_changed = children.changed[i]
-    fit_parent(i, box, has_changed, parents)
+    changed = int(0)
+    first = i - i % WIDTH
+    for child in range(first + first_child(), wp.min(first + WIDTH, children.boxes.shape[0]), child_step()):
+        box = union_of_boxes(box, read_box(children.boxes, child))
+        changed = changed | children.changed[child]
+    write_node(parents, i / WIDTH, box, changed)
 
 
 @wp.func
@@ -202,7 +243,7 @@ def _nodes_to_visit(clusters: HierarchyLevel, cluster: int, box: BoxRows, level:
 
 
 @made_once
-def traversal_kernel(visit: Callable, arguments_type: type, **module_options: int) -> wp.Kernel:
+def traversal_kernel(visit: Callable, arguments_type: type, padded: bool, **module_options: int) -> wp.Kernel:
     """Returns a kernel that visits the pairs of faces whose boxes no axis separates at both ends, each pair once.
 
     Its parameters are a :class:`FaceHierarchy`, the first cluster, the warps of a cluster and the arguments; launch it
@@ -213,8 +254,74 @@ def traversal_kernel(visit: Callable, arguments_type: type, **module_options: in
             is paired with that at ``first + k`` for each bit k of ``found``. On a GPU all threads of a warp call it
             together, each for its own face of one cluster, some with no bits; a thread for many ``first`` or none.
         arguments_type: Type of the last argument, a struct of Warp.
+        padded: Whether boxes have a padding.
         module_options: Options of the kernel's module.
     """
+
+    @wp.func
+    def box_at(mesh: FaceHierarchy, place: int):
+        """Returns the box of what is finite at a place."""
+        if wp.static(padded):
+            return _box_of_finite(read_padded_corners(mesh.corners, place), mesh.swept)
+        else:
+            return _box_of_finite(read_corners(mesh.corners, read_cell(mesh.faces, place)), mesh.swept)
+
+    @wp.func
+    def visit_cluster(
+        mesh: FaceHierarchy,
+        cluster: int,
+        cluster_box: BoxRows,
+        place: int,
+        box: BoxRows,
+        flags: wp.uint32,
+        other: int,
+        arguments: arguments_type,
+    ):
+        """Visits the faces of another cluster, the same or a later one, that no axis separates from a face of a first.
+
+        All threads of a warp test those of them together that the box of the first is not separated from.
+        """
+        first = other * WIDTH
+        node = read_box(mesh.clusters.boxes, other)
+        coded_cluster = coded_box(cluster_box, node)
+        coded = wp.vec4ui()
+        near = wp.uint32(0)
+        changes = wp.uint32(0)
+        for child in range(first_child(), WIDTH, child_step()):
+            coded = read_coded(mesh.places.coded, first + child)
+            bit = wp.uint32(1) << wp.uint32(child)
+            if (coded[0] & _COVERS) != wp.uint32(0) and not codes_apart(coded_cluster, coded):
+                if same_world(mesh.clusters, cluster, mesh.places, first + child):
+                    near = near | bit
+            if (coded[0] & _CHANGED) != wp.uint32(0):
+                changes = changes | bit
+        left = union_of_warp(near)
+        changes = union_of_warp(changes)
+        if mesh.clusters.changed[cluster] == 0:
+            left = left & changes
+        if left == wp.uint32(0):
+            return
+        sought = left
+        if (flags & _CHANGED) == wp.uint32(0):
+            sought = sought & changes
+        if first <= place:
+            own = wp.uint32(1) << wp.uint32(place - first)
+            sought = sought & ~(own | (own - wp.uint32(1)))
+        if (flags & _COVERS) == wp.uint32(0):
+            sought = wp.uint32(0)
+        coded_own = coded_box(box, node)
+        found = wp.uint32(0)
+        while left != wp.uint32(0):
+            bit = left & (~left + wp.uint32(1))
+            left = left ^ bit
+            child = lowest_set_bit(bit)
+            coded_other = code_of_child(coded, child)
+            if child_step() == 1:
+                coded_other = read_coded(mesh.places.coded, first + child)
+            if not codes_apart(coded_own, coded_other):
+                if (sought & bit) != wp.uint32(0) and same_world(mesh.places, place, mesh.places, first + child):
+                    found = found | bit
+        visit(place, first, found, arguments)
 
     @wp.kernel(**NO_GRADIENTS, module_options=module_options)
     def traverse(mesh: FaceHierarchy, first_cluster: int, warps_of_cluster: int, arguments: arguments_type):
@@ -222,8 +329,9 @@ def traversal_kernel(visit: Callable, arguments_type: type, **module_options: in
         cluster = first_cluster + i / (WIDTH * warps_of_cluster)
         part = (i / WIDTH) % warps_of_cluster
         place = cluster * WIDTH + i % WIDTH
-        box = read_box(mesh.places.boxes, place)
         cluster_box = read_box(mesh.clusters.boxes, cluster)
+        box = box_at(mesh, place)
+        flags = mesh.places.coded[place, 0]
         own_bundle = cluster / WIDTH
         own_group = own_bundle / WIDTH
         turn = int(0)
@@ -245,24 +353,23 @@ def traversal_kernel(visit: Callable, arguments_type: type, **module_options: in
                     if bundle == own_bundle:
                         clusters = clusters & bits_from(cluster % WIDTH)
                     while clusters != wp.uint32(0):
-                        first = (bundle * WIDTH + lowest_set_bit(clusters)) * WIDTH
+                        other = bundle * WIDTH + lowest_set_bit(clusters)
                         clusters = clusters & (clusters - wp.uint32(1))
                         if turn % warps_of_cluster == part:
-                            faces = unseparated_children(mesh.clusters, cluster, cluster_box, mesh.places, first)
-                            if faces != wp.uint32(0):
-                                changed = changed_children(mesh.places, first)
-                                found = unseparated_faces(mesh.places, place, box, first, faces, changed)
-                                visit(place, first, found, arguments)
+                            visit_cluster(mesh, cluster, cluster_box, place, box, flags, other, arguments)
                         turn += 1
 
     return traverse
 
 
-def _level(count: int, worlds: np.ndarray | None, device: wp.Device) -> HierarchyLevel:
+def _level(count: int, worlds: np.ndarray | None, device: wp.Device, *, of_faces: bool = False) -> HierarchyLevel:
     """Allocates a level of nodes; worlds: the lowest and the highest of each, int, shape [2, count], or None."""
     level = HierarchyLevel()
-    level.boxes = wp.empty((count, 4), dtype=wp.vec3, device=device)
-    level.changed = wp.zeros(count, dtype=int, device=device)
+    if of_faces:
+        level.coded = wp.empty((count, 4), dtype=wp.uint32, device=device)
+    else:
+        level.boxes = wp.empty((count, 4), dtype=wp.vec3, device=device)
+        level.changed = wp.zeros(count, dtype=int, device=device)
     if worlds is not None:
         level.first_world, level.last_world = (wp.array(w.astype(np.int32), dtype=int, device=device) for w in worlds)
     return level
@@ -299,7 +406,7 @@ def make_hierarchy(mesh: CollisionMesh, *, padded: bool) -> FaceHierarchy:
         filled = np.maximum.accumulate(np.where(order >= 0, np.arange(len(order)), 0))
         worlds = np.stack([world[filled], world[filled]])
     count = len(order)
-    hierarchy.places = _level(count, worlds, device)
+    hierarchy.places = _level(count, worlds, device, of_faces=True)
     count, worlds = count // WIDTH, _parents(worlds)
     hierarchy.clusters = _level(count, worlds, device)
     for name in ("bundles", "groups"):

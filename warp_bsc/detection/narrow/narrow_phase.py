@@ -17,6 +17,9 @@ from .contact_buffer import ContactBuffer, make_contact_buffer
 from .exact_phase import launch_exact_phase
 from .pair_kernels import PairBuffers, PairRule, cull_kernel, decide_kernel, gather_contacts, pad_keys
 
+_MANY = 2**22
+"""Pairs from which on there is room for half as many survivors and contacts of each at first, which saves memory."""
+
 
 class NarrowPhase:
     """Decides pairs of one kind, on the device.
@@ -42,8 +45,9 @@ class NarrowPhase:
         self._bits = [max(1, int(count - 1).bit_length()) for count in elements]
         self.counts = counts
         self.queue = wp.empty(capacity, dtype=wp.vec2i, device=counts.device)
-        self.allocate_survivors(capacity // 2 + 64)
-        self.allocate_contacts(capacity // 8 + 64)
+        room = min(capacity, max(capacity // 2, _MANY))
+        self.allocate_survivors(room // 2 + 64)
+        self.allocate_contacts(room // 8 + 64)
 
     def allocate_survivors(self, capacity: int) -> None:
         """Replaces the queue of pairs that no cull decides."""

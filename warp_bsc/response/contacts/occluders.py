@@ -85,7 +85,7 @@ def find_nearest_in_hierarchy(padded: bool) -> wp.Kernel:
                 _kind, _pair, corners = pair_of_bit(mesh, place, other, bit)
                 _keep_nearest(arguments.step, corners, arguments.nearest)
 
-    return traversal_kernel(visit, NearestArguments)
+    return traversal_kernel(visit, NearestArguments, padded)
 
 
 @wp.kernel

@@ -192,7 +192,8 @@ def _kernel(keep_distances: bool, padded: bool, on_arcs: bool) -> wp.Kernel:
                 if owner != ContactClass.NONE and straight:
                     decide(arguments, kind, pair, corners, owner)
 
-    return traversal_kernel(visit, _Arguments, optimization_level=2)  # by default, 3, NVRTC takes 1.7 times as long
+    # by default, 3, NVRTC takes 1.7 times as long
+    return traversal_kernel(visit, _Arguments, padded, optimization_level=2)
 
 
 def find_contacts_without_queues(
