@@ -114,6 +114,8 @@ def count_set_bits(bits: wp.uint32) -> int:
 
 _ABOVE = wp.constant(wp.uint32((1 << 9) | (1 << 19) | (1 << 29)))
 """The bits above three coordinates of 9 bits."""
+NOWHERE = wp.constant(wp.uint32(511 | (511 << 10) | (511 << 20)))
+"""Each row of the coded box of nothing, which is apart from all."""
 
 
 @wp.struct
@@ -165,12 +167,12 @@ def write_node(level: HierarchyLevel, node: int, box: BoxRows, changed: int):
         for (int axis = 0; axis < 3; ++axis) {
             const float low = node.data[row & 2][axis], extent = node.data[row | 1][axis] - low;
 #if defined(__CUDA_ARCH__)
-            float scale = __fdividef(509.0f, extent);
+            float scale = __fdividef(508.0f, extent);
 #else
-            float scale = 509.0f / extent;
+            float scale = 508.0f / extent;
 #endif
             const float steps = (box.data[row][axis] - low) * wp::min(wp::max(scale, 1.0e-38f), 3.0e38f);
-            word |= (wp::uint32)(wp::min(wp::max(steps, -1.0f), 510.0f) + 1.0f) << 10 * axis;
+            word |= (wp::uint32)(wp::min(wp::max(steps, -1.0f), 509.0f) + 1.0f) << 10 * axis;
         }
         coded[row] = word;
     }
@@ -180,8 +182,8 @@ def write_node(level: HierarchyLevel, node: int, box: BoxRows, changed: int):
 def coded_box(box: BoxRows, node: BoxRows) -> wp.vec4ui:
     """Returns a box in that of a node: each coordinate in 9 bits, with a free one above them, a row in one number.
 
-    Coordinates become numbers in [0, 511] by the same function, which keeps their order, however it is rounded: where
-    two of them differ, in this order, so do the coordinates.
+    Coordinates become numbers in [0, 510] by one function, which keeps their order, however it is rounded: where two of
+    them differ, in this order, so do the coordinates.
     """
     ...
 

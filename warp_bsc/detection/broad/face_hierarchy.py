@@ -1,10 +1,10 @@
 """A hierarchy of boxes over the faces of a mesh, and its traversal on a GPU.
 
 The hierarchy is made once, from the connectivity of the mesh, see :mod:`.face_order`: patches of connected faces stay
-compact however a mesh moves. A run only fits its boxes; those of faces are coded in the boxes of their clusters, in 16
-bytes. Edges that no face has and points have places as well, as faces that have collapsed: the cells of the mesh are its
-faces, then these edges, then the points. Cells without neighbours are in no order, and in the worst case are compared by
-brute force, 1,024 pairs of cells at a time.
+compact however a mesh moves. A run only fits boxes; those of faces are coded in their clusters', in 16 bytes. Edges that
+no face has and points have places as well, as faces that have collapsed: the cells of the mesh are its faces, then these
+edges, then the points. Cells without neighbours are in no order, and in the worst case are compared by brute force,
+1,024 pairs of cells at a time.
 
 Each node has 32 children: faces, clusters, bundles, and groups, all of which a traversal tests with each cluster.
 """
@@ -31,6 +31,7 @@ from ...kernels.pipeline.corners import (
     write_vertex,
 )
 from ...kernels.pipeline.hierarchy import (
+    NOWHERE,
     WIDTH,
     HierarchyLevel,
     bits_from,
@@ -55,8 +56,8 @@ from ..run.settings import NO_GRADIENTS
 FEW_NODES = 8
 """Nodes of a level above the clusters up to which all are traversed: their boxes would take longer than they save."""
 
-_CHANGED, _COVERS = wp.constant(wp.uint32(1 << 30)), wp.constant(wp.uint32(1 << 31))
-"""Bits of the first number of a coded box: whether pairs of the face are sought, and whether it has what is finite."""
+_SOUGHT = wp.constant(wp.uint32(1 << 31))
+"""Bit of the first number of a face's coded box: whether pairs of the face are sought."""
 
 
 @wp.struct
@@ -132,7 +133,7 @@ def round_kernel(dtype: type) -> wp.Kernel:
 
 
 @wp.func
-def _box_of_finite(corners: Any, swept: bool) -> BoxRows:
+def _box_of(corners: Any, swept: bool) -> BoxRows:
     """Returns the box of the corners of a cell that are finite."""
     box = empty_box()
     for j in range(3):
@@ -142,13 +143,28 @@ def _box_of_finite(corners: Any, swept: bool) -> BoxRows:
 
 
 @wp.func
-def _is_sought(mesh: FaceHierarchy, changed: wp.array[int], i: int) -> bool:
-    """Returns whether pairs of the cell at a place are sought."""
-    if mesh.order[i] < 0 or (mesh.only_free and mesh.order[i] < mesh.face_count):
+def _box_at(mesh: FaceHierarchy, place: int) -> BoxRows:
+    """Returns the box of the cell at a place, from the rows of its vertices."""
+    if mesh.order[place] < 0:
+        return empty_box()
+    return _box_of(read_corners(mesh.corners, read_cell(mesh.faces, place)), mesh.swept)
+
+
+@wp.func
+def _padded_box_at(mesh: FaceHierarchy, place: int) -> BoxRows:
+    """Returns the box of the cell at a place, from its own row."""
+    if mesh.order[place] < 0:
+        return empty_box()
+    return _box_of(read_padded_corners(mesh.corners, place), mesh.swept)
+
+
+@wp.func
+def _is_sought(mesh: FaceHierarchy, changed: wp.array[int], cell: int, vertices: wp.vec4i) -> bool:
+    """Returns whether pairs of a cell are sought."""
+    if cell < 0 or (mesh.only_free and cell < mesh.face_count):
         return False
-    cell = read_cell(mesh.faces, i)
     if changed:
-        return (changed[cell[0]] | changed[cell[1]] | changed[cell[2]]) != 0
+        return (changed[vertices[0]] | changed[vertices[1]] | changed[vertices[2]]) != 0
     return True
 
 
@@ -160,22 +176,7 @@ def fit_kernel(dtype: type, padded: bool) -> wp.Kernel:
         dtype: Type of the positions, which only boxes with a padding are computed from; others from rows of vertices.
         padded: Whether boxes have a padding.
     """
-
-    @wp.func
-    def box_at(x0: wp.array[dtype], x1: wp.array[dtype], padding: wp.array[wp.float64], mesh: FaceHierarchy, i: int):
-        """Returns the box of what is finite at a place."""
-        if mesh.order[i] < 0:
-            return empty_box()
-        cell = read_cell(mesh.faces, i)
-        if wp.static(not padded):
-            return _box_of_finite(read_corners(mesh.corners, cell), mesh.swept)
-        else:
-            pad = wp.max(wp.max(padding[cell[0]], padding[cell[1]]), padding[cell[2]])
-            corners = PaddedCorners()
-            for j in range(3):
-                corners = with_padded_corner(corners, j, x0[cell[j]], x1[cell[j]], pad)
-            write_padded_corners(mesh.corners, i, corners)
-            return _box_of_finite(corners, mesh.swept)
+    box_at = _padded_box_at if padded else _box_at
 
     @wp.kernel(**NO_GRADIENTS)
     def fit(
@@ -195,19 +196,26 @@ def fit_kernel(dtype: type, padded: bool) -> wp.Kernel:
         united = empty_box()
         any_sought = int(0)
         for place in range(first + first_child(), first + WIDTH, child_step()):
-            box = box_at(x0, x1, padding, mesh, place)
+            cell = read_cell(mesh.faces, place)
+            if wp.static(padded):
+                pad = wp.max(wp.max(padding[cell[0]], padding[cell[1]]), padding[cell[2]])
+                corners = PaddedCorners()
+                for j in range(3):
+                    corners = with_padded_corner(corners, j, x0[cell[j]], x1[cell[j]], pad)
+                write_padded_corners(mesh.corners, place, corners)
+            box = box_at(mesh, place)
             united = union_of_boxes(united, box)
-            if _is_sought(mesh, changed, place):
+            if _is_sought(mesh, changed, mesh.order[place], cell):
                 any_sought = 1
         cluster_box = write_node(mesh.clusters, i / WIDTH, united, any_sought)
         for place in range(first + first_child(), first + WIDTH, child_step()):
             if child_step() == 1:
-                box = box_at(x0, x1, padding, mesh, place)
+                box = box_at(mesh, place)
             coded = coded_box(box, cluster_box)
-            if box[0][0] <= box[1][0]:
-                coded[0] = coded[0] | _COVERS
-            if _is_sought(mesh, changed, place):
-                coded[0] = coded[0] | _CHANGED
+            if box[0][0] > box[1][0]:
+                coded = wp.vec4ui(NOWHERE)
+            if _is_sought(mesh, changed, mesh.order[place], read_cell(mesh.faces, place)):
+                coded[0] = coded[0] | _SOUGHT
             for row in range(4):
                 mesh.places.coded[place, row] = coded[row]
 
@@ -257,14 +265,7 @@ def traversal_kernel(visit: Callable, arguments_type: type, padded: bool, **modu
         padded: Whether boxes have a padding.
         module_options: Options of the kernel's module.
     """
-
-    @wp.func
-    def box_at(mesh: FaceHierarchy, place: int):
-        """Returns the box of what is finite at a place."""
-        if wp.static(padded):
-            return _box_of_finite(read_padded_corners(mesh.corners, place), mesh.swept)
-        else:
-            return _box_of_finite(read_corners(mesh.corners, read_cell(mesh.faces, place)), mesh.swept)
+    box_at = _padded_box_at if padded else _box_at
 
     @wp.func
     def visit_cluster(
@@ -273,7 +274,6 @@ def traversal_kernel(visit: Callable, arguments_type: type, padded: bool, **modu
         cluster_box: BoxRows,
         place: int,
         box: BoxRows,
-        flags: wp.uint32,
         other: int,
         arguments: arguments_type,
     ):
@@ -286,29 +286,26 @@ def traversal_kernel(visit: Callable, arguments_type: type, padded: bool, **modu
         coded_cluster = coded_box(cluster_box, node)
         coded = wp.vec4ui()
         near = wp.uint32(0)
-        changes = wp.uint32(0)
+        sought = wp.uint32(0)
         for child in range(first_child(), WIDTH, child_step()):
             coded = read_coded(mesh.places.coded, first + child)
             bit = wp.uint32(1) << wp.uint32(child)
-            if (coded[0] & _COVERS) != wp.uint32(0) and not codes_apart(coded_cluster, coded):
+            if not codes_apart(coded_cluster, coded):
                 if same_world(mesh.clusters, cluster, mesh.places, first + child):
                     near = near | bit
-            if (coded[0] & _CHANGED) != wp.uint32(0):
-                changes = changes | bit
+            if (coded[0] & _SOUGHT) != wp.uint32(0):
+                sought = sought | bit
         left = union_of_warp(near)
-        changes = union_of_warp(changes)
+        sought = union_of_warp(sought)
         if mesh.clusters.changed[cluster] == 0:
-            left = left & changes
+            left = left & sought
         if left == wp.uint32(0):
             return
-        sought = left
-        if (flags & _CHANGED) == wp.uint32(0):
-            sought = sought & changes
+        if (mesh.places.coded[place, 0] & _SOUGHT) != wp.uint32(0):
+            sought = left
         if first <= place:
             own = wp.uint32(1) << wp.uint32(place - first)
             sought = sought & ~(own | (own - wp.uint32(1)))
-        if (flags & _COVERS) == wp.uint32(0):
-            sought = wp.uint32(0)
         coded_own = coded_box(box, node)
         found = wp.uint32(0)
         while left != wp.uint32(0):
@@ -331,7 +328,6 @@ def traversal_kernel(visit: Callable, arguments_type: type, padded: bool, **modu
         place = cluster * WIDTH + i % WIDTH
         cluster_box = read_box(mesh.clusters.boxes, cluster)
         box = box_at(mesh, place)
-        flags = mesh.places.coded[place, 0]
         own_bundle = cluster / WIDTH
         own_group = own_bundle / WIDTH
         turn = int(0)
@@ -356,7 +352,7 @@ def traversal_kernel(visit: Callable, arguments_type: type, padded: bool, **modu
                         other = bundle * WIDTH + lowest_set_bit(clusters)
                         clusters = clusters & (clusters - wp.uint32(1))
                         if turn % warps_of_cluster == part:
-                            visit_cluster(mesh, cluster, cluster_box, place, box, flags, other, arguments)
+                            visit_cluster(mesh, cluster, cluster_box, place, box, other, arguments)
                         turn += 1
 
     return traverse
