@@ -23,7 +23,6 @@ from ..detection.inversions import Inversions
 from ..detection.mesh import CollisionMesh
 from ..detection.results.collisions import Collisions, DetectionStats, add_stats
 from ..detection.run.settings import Method
-from ..detection.run.start import is_cpu
 from ..usd.interval import Interval, positions_of
 from ..usd.scene import Scene
 from ..usd.segment import Segment
@@ -87,8 +86,6 @@ class IntervalChecker:
             ValueError: If the positions at some time are broken, or there is no such method.
         """
         detections = self._detect(first, stop, time.monotonic() + seconds)
-        if is_cpu(self._checks.device):
-            detections = read_ahead(detections)
         for results in map_ahead(_named, detections, _NAMING_THREADS):
             yield from results
 

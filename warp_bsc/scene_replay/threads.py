@@ -4,10 +4,40 @@ import contextvars
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import islice, repeat, takewhile
 from typing import Generic, TypeVar
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
+
+
+def map_ahead(function: Callable[[_Item], _Result], items: Iterable[_Item], threads: int) -> Iterator[_Result]:
+    """Yields ``function(item)`` for each item, in order, and meanwhile calls it for the next ones in other threads.
+
+    Items are taken in this thread, as soon as a call can begin. Closing the iterator waits for the calls that run.
+
+    Args:
+        function: The function; its calls run in this thread's context.
+        items: The items.
+        threads: Number of calls at a time; as many results wait.
+
+    Raises:
+        Exception: The error of an item or of its call, when that item is next.
+    """
+    iterator = iter(items)
+    calls: deque[Future[_Result]] = deque()
+    end: Exception | None = None
+    with ThreadPoolExecutor(threads, thread_name_prefix="map-ahead") as pool:
+        while end is None or calls:
+            while end is None and len(calls) <= threads:
+                try:
+                    calls.append(pool.submit(contextvars.copy_context().run, function, next(iterator)))
+                except Exception as error:  # also that after the last item: StopIteration
+                    end = error
+            if calls:
+                yield calls.popleft().result()
+    if not isinstance(end, StopIteration):
+        raise end
 
 
 def read_ahead(items: Iterable[_Item]) -> Iterator[_Item]:
@@ -19,49 +49,9 @@ def read_ahead(items: Iterable[_Item]) -> Iterator[_Item]:
         Exception: The error of making an item, when that item is next.
     """
     iterator = iter(items)
-    context = contextvars.copy_context()
-    nothing = []
-
-    def take() -> list[_Item]:
-        for item in iterator:
-            return [item]
-        return nothing
-
-    with ThreadPoolExecutor(1, thread_name_prefix="read-ahead") as pool:
-        following = pool.submit(context.run, take)
-        while taken := following.result():
-            following = pool.submit(context.run, take)
-            yield taken.pop()
-
-
-def map_ahead(function: Callable[[_Item], _Result], items: Iterable[_Item], threads: int) -> Iterator[_Result]:
-    """Yields ``function(item)`` for each item, in order, and meanwhile calls it for the next ones in other threads.
-
-    Items are taken in this thread, as soon as a call can begin. Closing the iterator waits for the calls that run.
-
-    Args:
-        function: The function; its calls run in this thread's context.
-        items: The items.
-        threads: Number of calls at a time.
-
-    Raises:
-        Exception: The error of an item or of its call, when that item is next.
-    """
-    iterator = iter(items)
-    calls: deque[Future[_Result]] = deque()
-    end: Exception | None = None
-    with ThreadPoolExecutor(threads, thread_name_prefix="map-ahead") as pool:
-        while True:
-            while end is None and len(calls) < threads:
-                try:
-                    calls.append(pool.submit(contextvars.copy_context().run, function, next(iterator)))
-                except Exception as error:  # also that of the last item: StopIteration
-                    end = error
-            if not calls:
-                break
-            yield calls.popleft().result()
-    if not isinstance(end, StopIteration):
-        raise end
+    taken = map_ahead(lambda _: list(islice(iterator, 1)), repeat(None), 1)
+    for some in takewhile(bool, taken):
+        yield some.pop()
 
 
 class WriteBehind(Generic[_Item]):

@@ -61,8 +61,3 @@ def gpu_count() -> int:
     """Returns the number of GPUs of this machine that Warp can use."""
     start_warp()
     return wp.get_cuda_device_count()
-
-
-def is_cpu(name: str | None) -> bool:
-    """Returns whether the Warp device of a name, Warp's current default for None, is a CPU."""
-    return wp.get_device(name).is_cpu
