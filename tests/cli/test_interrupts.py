@@ -234,7 +234,5 @@ def test_scene_that_changes_meanwhile(tmp_path, monkeypatch, capfd, change):
     message = f"{path}: the file has changed since it was opened"
     assert capfd.readouterr().err.splitlines()[-1] == f"warp-bsc: error: {message}"
     left = read_left(folder, f"stopped by an error: {message}")
-    assert left in (
-        [3] * len(OUTPUTS),
-        [2] * len(OUTPUTS),
-    )  # nothing is written any more, also where the third is just about to be
+    assert left == left[:1] * len(OUTPUTS)
+    assert left[0] in (None, 1, 2, 3)  # nothing is written any more, of what waits to be

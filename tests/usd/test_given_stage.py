@@ -62,9 +62,9 @@ def test_what_a_mask_leaves_out_is_not_read(tmp_path):
 
 
 def test_a_stage_that_changes_meanwhile_is_an_error(tmp_path, monkeypatch):
-    monkeypatch.setattr("warp_bsc.scene_replay.checking.FACES_AT_ONCE", 0)  # else all has been read before
+    monkeypatch.setattr("warp_bsc.scene_replay.checking.FACES_AT_ONCE", 0)
     stage = Usd.Stage.Open(save(falling_through_quads(tmp_path)))
-    scene = bsc.Scene(stage)
+    scene = bsc.Scene(stage, subdivide=8)  # else all has been read before
     results = bsc.replay(scene, device="cpu")
     next(results)
     UsdGeom.Imageable(stage.GetPrimAtPath("/World/Falling")).MakeInvisible()

@@ -1,10 +1,10 @@
 """A hierarchy of boxes over the faces of a mesh, and its traversal on a GPU.
 
 The hierarchy is made once, from the connectivity of the mesh, see :mod:`.face_order`: patches of connected faces stay
-compact however a mesh moves. A run only fits boxes; those of faces are coded in their clusters', in 16 bytes. Edges that
-no face has and points have places as well, as faces that have collapsed: the cells of the mesh are its faces, then these
-edges, then the points. Cells without neighbours are in no order, and in the worst case are compared by brute force,
-1,024 pairs of cells at a time.
+compact however a mesh moves. A run only fits boxes; those of faces are coded in those of their clusters, in 16 bytes.
+Edges that no face has and points have places as well, as faces that have collapsed: the cells of the mesh are its
+faces, then these edges, then the points. Cells without neighbours are in no order, and in the worst case are compared
+by brute force, 1,024 pairs of cells at a time.
 
 Each node has 32 children: faces, clusters, bundles, and groups, all of which a traversal tests with each cluster.
 """
