@@ -32,17 +32,17 @@ _QUADRATIC_DISCRIMINANT = """
     const Integer* of_c[3] = {&c0, &c1, &c2};
     Number c[3];
     scale(of_c, 3, c);
-    return sign(minus(times(c[1], c[1]), times(by(4.0, c[0]), c[2])));
+    return sign(c[1] * c[1] - c[0] * c[2] * 4.0);
 """
 
 _CUBIC_DISCRIMINANT = """
     const Integer* of_c[4] = {&c0, &c1, &c2, &c3};
     Number c[4];
     scale(of_c, 4, c);
-    const Number h0 = minus(times(c[1], c[1]), times(by(3.0, c[0]), c[2]));
-    const Number h1 = minus(times(c[1], c[2]), times(by(9.0, c[0]), c[3]));
-    const Number h2 = minus(times(c[2], c[2]), times(by(3.0, c[1]), c[3]));
-    return sign(minus(times(by(4.0, h0), h2), times(h1, h1)));
+    const Number h0 = c[1] * c[1] - c[0] * c[2] * 3.0;
+    const Number h1 = c[1] * c[2] - c[0] * c[3] * 9.0;
+    const Number h2 = c[2] * c[2] - c[1] * c[3] * 3.0;
+    return sign(h0 * h2 * 4.0 - h1 * h1);
 """
 
 _SIGN_AT_TIME = """
@@ -50,8 +50,7 @@ _SIGN_AT_TIME = """
     Number p[4];
     scale(of_p, 4, p);
     const double whole = (double)(1ull << digits), t = (double)time / whole, s = 1.0 - t;  // all exact
-    const Number ends = plus(by(s * s * s, p[0]), by(t * t * t, p[3]));
-    return sign(plus(ends, plus(by(s * s * t, p[1]), by(s * t * t, p[2]))));
+    return sign(p[0] * (s * s * s) + p[3] * (t * t * t) + (p[1] * (s * s * t) + p[2] * (s * t * t)));
 """
 
 for _limbs in LIMBS[1:]:

@@ -231,7 +231,7 @@ def _component_signs(
 
 
 @wp.func
-def first_contact_exactly(kind: int, polygon: wp.array[Any], timed: bool, digits: int) -> wp.float64:
+def first_contact_exactly(kind: int, polygon: wp.array[Any], timed: bool, digits: int, is_wide: bool) -> wp.float64:
     """Returns the time of the first contact of a query, rounded down to a multiple of 2^-digits, or NONE.
 
     Args:
@@ -239,6 +239,7 @@ def first_contact_exactly(kind: int, polygon: wp.array[Any], timed: bool, digits
         polygon: The polygon of the query, of at most BITS.
         timed: Whether the time is needed; if not, any time of at most 1 stands for contact.
         digits: Binary digits of the time, at most 38.
+        is_wide: Whether signs at roots take much longer than components.
     """
     corners = wp.where(kind == VERTEX_FACE, 3, 4)
     v0, v1, v2, v3 = volume(polygon, corners - 1)
@@ -262,35 +263,31 @@ def first_contact_exactly(kind: int, polygon: wp.array[Any], timed: bool, digits
     roots = count_cubic_roots(v0, v1, v2, v3)
     is_open = wp.vec3i(wp.where(roots == 3, 1, 0), wp.where(roots > 1, 1, 0), wp.where(roots > 0, 1, 0))
     hit = wp.vec3i(0, 0, 0)
-    axis = int(0)
-    while axis < 3 and wp.max(is_open) > 0:
+    # of wide integers, components without roots along all axes first: most often they decide the query
+    attempt = wp.where(is_wide, 0, 3)
+    while attempt < 6 and wp.max(is_open) > 0:
         low = wp.vec3i(0, 0, 0)
         high = wp.vec3i(0, 0, 0)
-        # components without roots first: they take little time, and opposite signs decide the query
-        later = int(0)  # the others, as bits
+        later = int(0)  # the components with roots, as bits
         step = int(0)
-        while step < 2 * corners:
+        while step < wp.where(attempt < 3, corners, 2 * corners):
             corner = wp.where(step < corners, step, step - corners)
             is_next = step < corners or ((later >> corner) & 1) == 1
             if is_next and wp.max(wp.cw_mul(is_open, wp.vec3i(1, 1, 1) + wp.cw_mul(low, high))) > 0:
                 signs, turns = _component_signs(
-                    polygon, corner, _next(corner, corners), axis, v0, v1, v2, v3, roots, step < corners
+                    polygon, corner, _next(corner, corners), attempt % 3, v0, v1, v2, v3, roots, step < corners
                 )
                 if turns and step < corners:
                     later = later | (1 << corner)
                 low = wp.min(low, signs)
                 high = wp.max(high, signs)
             step += 1
-        one_sign = wp.cw_mul(is_open, high - low)  # 0: all are zero, 1: one weak sign, 2: opposite signs
-        hit += wp.vec3i(
-            wp.where(one_sign[0] == 1, 1, 0), wp.where(one_sign[1] == 1, 1, 0), wp.where(one_sign[2] == 1, 1, 0)
-        )
-        is_open = wp.vec3i(
-            wp.where(one_sign[0] == 0, is_open[0], 0),
-            wp.where(one_sign[1] == 0, is_open[1], 0),
-            wp.where(one_sign[2] == 0, is_open[2], 0),
-        )
-        axis += 1
+        is_known = wp.where(attempt < 3 and later != 0, 0, 1)
+        for root in range(3):
+            one_sign = is_open[root] * (high[root] - low[root])  # 0: all are zero, 1: one weak sign, 2: opposite signs
+            hit[root] += wp.where(one_sign == 1, is_known, 0)
+            is_open[root] = wp.where(one_sign == 2 or (one_sign == 1 and is_known == 1), 0, is_open[root])
+        attempt += 1
     if wp.max(hit) > 0:
         if not timed:
             return _0
@@ -308,9 +305,9 @@ for _limbs in BITS:
     _Integer = integer(_limbs)
 
     @wp.func
-    def _decide(kind: int, polygon: wp.array[_Integer], timed: bool, digits: int) -> wp.float64:
+    def _decide(kind: int, polygon: wp.array[_Integer], timed: bool, digits: int, is_wide: bool) -> wp.float64:
         """Returns :func:`first_contact_exactly`; an array of a known type is not copied at each call."""
-        return first_contact_exactly(kind, polygon, timed, digits)
+        return first_contact_exactly(kind, polygon, timed, digits, is_wide)
 
 
 @functools.cache
@@ -340,6 +337,6 @@ def decide_in(limbs: int) -> wp.Function:
             make_polygon(kind == EDGE_EDGE, query, exponents, polygon)
         elif fits == 0:
             return TOO_WIDE
-        return _decide(kind, polygon, timed, digits)
+        return _decide(kind, polygon, timed, digits, wp.static(limbs > 1))
 
     return decide

@@ -36,7 +36,8 @@ def classify_batch_of(dtype: type, vertex_face: bool) -> wp.Function:
         of pairs, the first pair of the batch, the number of pairs in it, at most :data:`BATCH`, and the roundoff. It
         returns two bits for each pair: its status, or :data:`OPEN`. Indices are not checked.
     """
-    snippet = native_for_pairs(dtype, vertex_face, "simd_query.h", "batch_classification.h", **_CONSTANTS)
+    headers = ("simd_query.h", "simd_roots.h", "batch_classification.h")
+    snippet = native_for_pairs(dtype, vertex_face, *headers, **_CONSTANTS)
 
     @wp.func_native(snippet)
     def classify_batch(

@@ -21,10 +21,8 @@ import functools
 
 import warp as wp
 
-from ..culling import DIRECTION_ERROR
-from ..polynomials import COPLANARITY_ERROR
-from ..signs import UNDERFLOW
 from .simd import native_for_pairs
+from .simd_query import QUERY_CONSTANTS
 
 BATCH = wp.constant(64)
 """Pairs that one call culls."""
@@ -45,17 +43,9 @@ def cull_batch_of(dtype: type, vertex_face: bool) -> wp.Function:
         of pairs, the first of the batch, their number, at most :data:`BATCH`, whether boxes are known to meet, and the
         roundoff. It returns a bit for each pair, set where no cull decides it. Indices are not checked.
     """
-    snippet = native_for_pairs(
-        dtype,
-        vertex_face,
-        "batch_culling.h",
-        batch=int(BATCH),
-        coplanarity_error=float(COPLANARITY_ERROR),
-        direction_error=float(DIRECTION_ERROR),
-        underflow=float(UNDERFLOW),
-        largest_size=_LARGEST,
-        flushed=40.0 * 2.0 ** (-126 if dtype is wp.vec3 else -1022),
-    )
+    flushed = 40.0 * 2.0 ** (-126 if dtype is wp.vec3 else -1022)
+    constants = QUERY_CONSTANTS | {"batch": int(BATCH), "largest_size": _LARGEST, "flushed": flushed}
+    snippet = native_for_pairs(dtype, vertex_face, "simd_query.h", "batch_culling.h", **constants)
 
     @wp.func_native(snippet)
     def cull_batch(

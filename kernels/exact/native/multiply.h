@@ -5,6 +5,20 @@ const auto multiply = [](const auto& x, const auto& y, wp::uint64* p) {
     for (int i = 0; i < R; ++i)
         p[i] = 0;
 #if !defined(__CUDA_ARCH__)
+    if constexpr (A == 4 && B == 4) {
+        const auto is_short = [](const auto& a) { return a[2] == 0 - (a[1] >> 63) && a[3] == a[2]; };
+        if (is_short(x) && is_short(y)) {  // as nearly all are
+            typedef unsigned __int128 Wide;
+            const Wide a = (Wide)x[1] << 64 | x[0], b = (Wide)y[1] << 64 | y[0];
+            const Wide low = (Wide)x[0] * y[0], one = (Wide)x[0] * y[1] + (low >> 64);
+            const Wide other = (Wide)x[1] * y[0] + (wp::uint64)one, outer = (one >> 64) + (other >> 64);
+            const Wide high = (Wide)x[1] * y[1] + outer - (x[1] >> 63 ? b : 0) - (y[1] >> 63 ? a : 0);
+            p[0] = (wp::uint64)low, p[1] = (wp::uint64)other, p[2] = (wp::uint64)high;
+            for (int i = 3; i < R; ++i)
+                p[i] = i == 3 ? (wp::uint64)(high >> 64) : 0 - (p[3] >> 63);
+            return;
+        }
+    }
     if constexpr (A * B >= 64) {
         // only the limbs that are not zero, of absolute values: most numbers are much narrower than their type
         struct Limbs {

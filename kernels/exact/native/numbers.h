@@ -3,11 +3,11 @@
 // a value, and the same expression in absolute values
 struct Number {
     double value, size;
+    Number operator+(Number b) const { return {value + b.value, size + b.size}; }
+    Number operator-(Number b) const { return {value - b.value, size + b.size}; }
+    Number operator*(Number b) const { return {value * b.value, size * b.size}; }
+    Number operator*(double b) const { return {value * b, size * b}; }
 };
-const auto plus = [](Number a, Number b) { return Number{a.value + b.value, a.size + b.size}; };
-const auto minus = [](Number a, Number b) { return Number{a.value - b.value, a.size + b.size}; };
-const auto times = [](Number a, Number b) { return Number{a.value * b.value, a.size * b.size}; };
-const auto by = [](double a, Number b) { return Number{a * b.value, a * b.size}; };
 const auto sign = [](Number a) -> int {
     const double error = 0x1p-47 * a.size + 0x1p-800;
     return (a.value > error) - (a.value < -error);
@@ -33,12 +33,7 @@ const auto scale = [](const Integer* const* x, int count, Number* to) {
     }
     for (int j = 0; j < count; ++j) {
         const int shift = 64 * (exponents[j] - largest);
-        union {
-            wp::uint64 bits;
-            double value;
-        } factor;
-        factor.bits = shift > -960 ? (wp::uint64)(1023 + shift) << 52 : 0;
-        to[j].value *= factor.value;
+        to[j].value *= __builtin_bit_cast(double, shift > -960 ? (wp::uint64)(1023 + shift) << 52 : 0);
         to[j].size = to[j].value < 0.0 ? -to[j].value : to[j].value;
     }
 };

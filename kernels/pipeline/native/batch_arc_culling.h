@@ -21,18 +21,17 @@ struct Packet {
     int all, usable;
 };
 auto read_packet = [&](const int* which, int filled) -> Packet {
-    int slots[8];
+    auto slot = [&](int lane) { return first + which[lane < filled ? lane : 0]; };
     Doubles distance;
     for (int lane = 0; lane < 8; ++lane) {
-        slots[lane] = first + which[lane < filled ? lane : 0];
         int corner[4];
-        corners_of(slots[lane], corner);
+        corners_of(slot(lane), corner);
         const double* of = (const double*)deviation.data;
         const double a = of[corner[0]], b = of[corner[1]], other = larger_of(of[corner[2]], of[corner[3]]);
         distance[lane] = vertex_face ? a + larger_of(b, other) : larger_of(a, b) + other;
     }
     Scalars points[24];
-    read_points(slots, points);
+    read_points(slot, points);
     const int all = (1 << filled) - 1;
     int usable = all;
     const Motion motion = scaled_motion(points, usable);
@@ -62,15 +61,12 @@ for (int begin = 0; begin < count; begin += 8) {
     const Cubic k = y.k;
     int unsure = packet.all & ~(bits(above(k) | above({-k.k0, -k.k1, -k.k2, -k.k3})) & usable);
 
-    // the direction through the centroids
-    const Vectors us = plus(motion.u0, motion.u1), vs = plus(motion.v0, motion.v1);
-    const Vectors ws = plus(motion.w0, motion.w1);
+    const Vectors size = plus(plus(motion.u_size, motion.v_size), motion.w_size);
     if (unsure) {
-        const Vectors direction =
-            vertex_face ? minus(ws, times(1.0 / 3.0, plus(us, vs))) : plus(ws, times(0.5, minus(vs, us)));
+        const Vectors direction = centroid_direction(motion);
         const Gaps gaps = gaps_along(motion, direction);
-        const Doubles needed = kept * norm_bound(direction);
-        unsure &= ~(bits((gaps.low - gaps.bound > needed) | (-gaps.high - gaps.bound > needed)) & usable);
+        const Doubles bound = gap_bound(size, direction), needed = kept * norm_bound(direction);
+        unsure &= ~(bits((gaps.low - bound > needed) | (-gaps.high - bound > needed)) & usable);
     }
     for (; unsure; unsure &= unsure - 1)
         open[open_count++] = begin + __builtin_ctz(unsure);
@@ -97,8 +93,8 @@ for (int begin = 0; begin < open_count; begin += 8) {
         const Corners first = corners_along(direction, motion.u0, motion.v0, motion.w0);
         const Corners last = corners_along(direction, motion.u1, motion.v1, motion.w1);
         const Vectors size = plus(plus(motion.u_size, motion.v_size), motion.w_size);
-        const Doubles bound = roundoff * (direction_error * dot(sizes(direction, direction), size) + underflow);
-        const Doubles needed = kept * norm_bound(direction), more = needed * away + 2.0 * bound;
+        const Doubles bound = gap_bound(size, direction), needed = kept * norm_bound(direction),
+                      more = needed * away + 2.0 * bound;
         Doubles from = start, until = limit;
         for (int i = 0; i < corner_count; ++i) {
             const Doubles crossing = (more - first.x[i]) / (last.x[i] - first.x[i]);

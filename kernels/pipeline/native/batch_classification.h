@@ -1,103 +1,7 @@
-// The body of classify_batch; after simd_query.h.
+// The body of classify_batch; after simd_query.h and simd_roots.h.
 
-auto evaluate_cubic = [](Cubic k, Doubles a, Doubles b) {
-    return ((k.k0 * b + 3.0 * k.k1 * a) * b + 3.0 * k.k2 * a * a) * b + k.k3 * a * a * a;
-};
-auto evaluate_quadratic = [](Vectors q, Doubles a, Doubles b) { return (q.x * b + 2.0 * q.y * a) * b + q.z * a * a; };
-
-// a cubic with one extremum at most, the signs of its ends, and the lanes in which it has one or two roots
-struct Curve {
-    Cubic k;
-    Doubles bound, size;
-    Vectors d;
-    Signs start;
-    int one, two;
-};
-
-struct Ends {
-    Signs first, last;
-};
-auto linear_signs = [&](Doubles l0, Doubles l1, Doubles line_bound, const Curve& y) -> Ends {
-    const Signs s0 = sign(l0, line_bound), s1 = sign(l1, line_bound);
-    const int equal = ~((s0.positive ^ s1.positive) | (s0.negative ^ s1.negative));
-    auto from_lanes = [](int lanes) -> Longs {
-        return -__builtin_convertvector(__builtin_bit_cast(Bools, (unsigned char)lanes), Longs);
-    };
-    const Doubles a = where(from_lanes(known(s0)), absolute(l0), 4.0 * line_bound);
-    const Doubles b = where(from_lanes(known(s1)), absolute(l1), 4.0 * line_bound);
-    const int vague = ~(known(s0) & known(s1)) & bits(most(a, b) < 8.0 * line_bound);
-    const Doubles sum = a + b, square = sum * sum;
-    const Doubles y_bound = square * (2.0 * y.bound * sum + crossing_error * y.size * line_bound) + underflow * y.bound;
-    const Signs side = product(sign(evaluate_cubic(y.k, a, b), y_bound), y.start);
-    const Doubles slope_bound =
-        sum * (2.0 * difference_of_cubic * y.bound * sum + slope_crossing_error * y.size * line_bound) +
-        underflow * y.bound;
-    const Signs before = product(sign(evaluate_quadratic(y.d, a, b), slope_bound), y.start);
-    // with two roots, a root of the line outside of them is before or after both
-    const int after_line = (y.one & side.positive) | (y.two & side.positive & before.negative);
-    const int before_line = (y.one & side.negative) | (y.two & side.positive & before.positive);
-    const int amid = y.two & side.negative;
-    auto at = [&](int of_start, int of_end) {
-        const int lanes = ~vague;
-        const Signs found = {((of_start & s0.positive) | (of_end & s1.positive)) & lanes,
-                             ((of_start & s0.negative) | (of_end & s1.negative)) & lanes};
-        return chosen(equal, s0, found);
-    };
-    return {at(before_line | amid, after_line), at(before_line, after_line | amid)};
-};
-
-auto quadratic_signs = [&](Vectors q, Doubles q_bound, const Curve& y, int lanes) -> Ends {
-    const Signs constant = quadratic_sign(q, q_bound);
-    Ends result = {constant, constant};
-    lanes &= ~known(constant);
-    if (!lanes)
-        return result;
-    const Doubles leading = (q.z - q.y) - (q.y - q.x);
-    const Doubles chord_bound = q_bound + 0.25 * (absolute(leading) + 6.0 * q_bound);
-    const Ends chord = linear_signs(q.x, q.z, chord_bound, y);
-    result = {chosen(lanes, chord.first, constant), chosen(lanes, chord.last, constant)};
-    lanes &= ~(known(chord.first) & known(chord.last));
-    if (!lanes)
-        return result;
-    // division of the cubic by the quadratic
-    const Doubles d0 = q.y - q.x, d1 = q.z - q.y;
-    const Doubles e0 = (y.k.k2 - y.k.k1) - (y.k.k1 - y.k.k0), e1 = (y.k.k3 - y.k.k2) - (y.k.k2 - y.k.k1);
-    const Doubles leading_q = d1 - d0, leading_k = e1 - e0, square = leading_q * leading_q;
-    const Doubles l0 = 3.0 * e0 * leading_q - 2.0 * d0 * leading_k;
-    const Doubles l1 = 3.0 * e1 * leading_q - 2.0 * d1 * leading_k;
-    const Doubles r0 = square * y.k.k0 - l0 * q.x, r1 = square * y.k.k3 - l1 * q.z;
-    const Doubles q_size = largest_of(q);
-    const Doubles unit = y.size * q_bound + q_size * y.bound;
-    const Ends factor = linear_signs(l0, l1, factor_error * unit + underflow * y.bound, y);
-    const Ends rest = linear_signs(r0, r1, division_error * q_size * unit + underflow * y.bound, y);
-    return {chosen(known(result.first), result.first, negated(product(factor.first, rest.first))),
-            chosen(known(result.last), result.last, negated(product(factor.last, rest.last)))};
-};
-
-// the lanes in which a cubic certainly has no extremum, one, or may have two
-struct Shape {
-    int monotone, extremum, two_extrema;
-};
-auto curve_class = [&](const Curve& y) -> Shape {
-    const Doubles bound = difference_of_cubic * y.bound;
-    const Signs s0 = sign(y.d.x, bound), s1 = sign(y.d.y, bound), s2 = sign(y.d.z, bound);
-    const Signs outer = product(s0, s2), inner = product(s0, s1);
-    const Doubles discriminant = y.d.y * y.d.y - y.d.x * y.d.z;
-    const int rootless = bits(discriminant < -y.bound * (discriminant_error * largest_of(y.d) + underflow));
-    const int monotone = outer.positive & (inner.positive | rootless);
-    return {monotone, outer.negative, outer.positive & ~monotone & inner.negative};
-};
-auto curve_of = [&](Cubic k, Doubles bound) -> Curve {
-    const Doubles size = most(most(absolute(k.k0), absolute(k.k1)), most(absolute(k.k2), absolute(k.k3)));
-    return {k, bound, size, {k.k1 - k.k0, k.k2 - k.k1, k.k3 - k.k2}, sign(k.k0, bound), 0, 0};
-};
-
-struct Status {
-    int free, hit;
-};  // unsure in the other lanes
 auto classify_piece = [&](Curve y, const InsideTests& tests, int extremum, int lanes) -> Status {
-    const Signs end = sign(y.k.k3, y.bound);
-    const Signs ends = product(y.start, end);
+    const Signs ends = product(y.start, sign(y.k.k3, y.bound));
     y.one = ends.negative & lanes;
     y.two = 0;
     int none = ends.positive & ~extremum;
@@ -127,8 +31,7 @@ auto classify_piece = [&](Curve y, const InsideTests& tests, int extremum, int l
                 (ta + tb) * (6.0 * y.bound * (ta + tb) + slope_crossing_error * y.size * t_bound) + underflow * y.bound;
             const Signs side = sign(evaluate_quadratic(y.d, ta, tb), side_bound);
             const int as_slope = product(side, sign(d0, y.bound)).positive;
-            const int split = product(s0, s1).negative;
-            const int same = product(s0, s1).positive;
+            const int split = product(s0, s1).negative, same = product(s0, s1).positive;
             const int decided = same | (split & known(side));
             Signs at = chosen(split & as_slope, s1, s0);
             at = product({at.positive & decided, at.negative & decided}, sign(leading, turning_error * y.bound));
@@ -143,10 +46,15 @@ auto classify_piece = [&](Curve y, const InsideTests& tests, int extremum, int l
         return status;
     Signs first[4], last[4];
     for (int i = 0; i < 4; ++i) {
-        const Ends found = quadratic_signs(tests.q[i], tests.bounds[i], y, rooted);
+        const Ends found = chord_signs(tests.q[i], tests.bounds[i], y, rooted);
         first[i] = found.first, last[i] = found.last;
     }
-    const Verdict at_first = verdict(first), at_last = verdict(last);
+    const int open = rooted & ~(verdict(first).free & verdict(last).free);
+    for (int i = 0; i < 4; ++i) {
+        const Ends found = quadratic_signs(tests.q[i], tests.bounds[i], y, {first[i], last[i]}, open);
+        first[i] = found.first, last[i] = found.last;
+    }
+    const Status at_first = verdict(first), at_last = verdict(last);
     status.free |= at_first.free & at_last.free & rooted;
     status.hit = (at_first.hit | at_last.hit) & rooted;
     return status;
@@ -154,7 +62,7 @@ auto classify_piece = [&](Curve y, const InsideTests& tests, int extremum, int l
 
 // the status in some lanes, from the inside tests of their axis
 auto classify_with = [&](Cubic k, Doubles bound, const InsideTests& tests, int lanes) -> Status {
-    const Verdict constant = constant_verdict(tests);
+    const Status constant = constant_verdict(tests);
     Curve curve = curve_of(k, bound);
     const Signs ends = product(curve.start, sign(k.k3, bound));
     Status status = {constant.free, constant.hit & ends.negative & ~constant.free};
@@ -190,7 +98,7 @@ auto classify_with = [&](Cubic k, Doubles bound, const InsideTests& tests, int l
             }
             curve = curve_of(part_k, split_error * square * sum * bound);
             shape = curve_class(curve);
-            found.free = known(cubic_sign(part_k, curve.bound)) | constant_verdict(part_tests).free;
+            found.free = one_sign(part_k, curve.bound) | constant_verdict(part_tests).free;
             lanes = split & ~found.free & known(curve.start) & known(sign(part_k.k3, curve.bound)) &
                     (shape.monotone | shape.extremum);
         }
@@ -227,16 +135,13 @@ auto without_zeros = [&](Cubic k) -> Cubic {
 unsigned long long statuses = 0;
 for (int begin = 0; begin < count; begin += 8) {
     const int filled = count - begin < 8 ? count - begin : 8;
-    int slots[8];
-    for (int lane = 0; lane < 8; ++lane)
-        slots[lane] = first + begin + (lane < filled ? lane : 0);
     Scalars points[24];
-    read_points(slots, points);
+    read_points([&](int lane) { return first + begin + (lane < filled ? lane : 0); }, points);
     const int all = (1 << filled) - 1;
     int usable = all;
     const Motion motion = scaled_motion(points, usable);
     const Coplanarity y = coplanarity(motion);
-    int free = known(cubic_sign(y.k, y.bound)), hit = 0, left = usable & ~free;
+    int free = one_sign(y.k, y.bound), hit = 0, left = usable & ~free;
     if (left) {
         const InsideTests tests = inside_tests(motion, y, largest_axis(plus(plus(plus(y.n0, y.nh), y.nh), y.n1)));
         Cubic k = y.k;
@@ -254,7 +159,7 @@ for (int begin = 0; begin < count; begin += 8) {
                 break;
             hit |= touching(k, tests) & lanes;
             k = without_zeros(k);
-            free |= known(cubic_sign(k, Doubles(0.0))) & lanes & ~hit;
+            free |= one_sign(k, Doubles(0.0)) & lanes & ~hit;
             left &= ~(free | hit);
             lanes = left & lanes;
         }
@@ -266,8 +171,7 @@ for (int begin = 0; begin < count; begin += 8) {
             hit |= left & ~apart;
         }
     }
-    free &= usable;
-    hit &= usable;
+    free &= usable, hit &= usable;
     const int unsure = usable & ~(free | hit), open = all & ~usable;
     auto spread = [](unsigned x) {
         x = (x | (x << 4)) & 0x0f0fu;

@@ -1,8 +1,7 @@
-// The body of cull_batch; after simd.h.
+// The body of cull_batch; after simd_query.h.
 
 // box test, pair by pair: x y z of both ends in one vector
-int near[batch];
-int near_count = 0;
+int near[batch], near_count = 0;
 for (int i = 0; i < count; ++i) {
     near[near_count] = i;
     if (boxes_meet) {
@@ -32,66 +31,37 @@ for (int i = 0; i < count; ++i) {
 unsigned long long left = 0;
 for (int begin = 0; begin < near_count; begin += 8) {
     const int filled = near_count - begin < 8 ? near_count - begin : 8;
-    int slots[8];
-    for (int lane = 0; lane < 8; ++lane)
-        slots[lane] = first + near[begin + (lane < filled ? lane : 0)];
     Scalars points[24];
-    read_points(slots, points);
+    read_points([&](int lane) { return first + near[begin + (lane < filled ? lane : 0)]; }, points);
 
-    // Bernstein signs
-    const Relative r = relative(points);
-    const Vectors u0 = r.u0, v0 = r.v0, w0 = r.w0, u1 = r.u1, v1 = r.v1, w1 = r.w1;
-    const Vectors n0 = cross(u0, v0), n1 = cross(u1, v1);
-    const Vectors twice_nh = plus(cross(u0, v1), cross(u1, v0));
-    const Doubles k0 = dot(w0, n0), k3 = dot(w1, n1);
-    const Doubles k1 = (dot(w0, twice_nh) + dot(w1, n0)) * (1.0 / 3.0);
-    const Doubles k2 = (dot(w1, twice_nh) + dot(w0, n1)) * (1.0 / 3.0);
     // bounds take longer than signs: only where some lane has one sign; with a roundoff of zero they are zero
+    const Relative r = relative(points);
     int unsure = (1 << filled) - 1;
-    const Doubles lowest_k = least(least(k0, k1), least(k2, k3)), highest_k = most(most(k0, k1), most(k2, k3));
-    if (bits((lowest_k > 0.0) | (highest_k < 0.0)) & unsure) {
-        Doubles bound = 0.0;
-        int trusted = 255;
-        if (roundoff > 0.0) {
-            const Vectors u = sizes(u0, u1), v = sizes(v0, v1), w = sizes(w0, w1);
-            const Vectors uv = {u.y * v.z + u.z * v.y, u.z * v.x + u.x * v.z, u.x * v.y + u.y * v.x};
+    auto decide = [&](auto signs_of, auto bound_of) {
+        const Doubles zero = 0.0;
+        int decided = signs_of(zero) & unsure;
+        if (decided && roundoff > 0.0) {
+            const Vectors u = sizes(r.u0, r.u1), v = sizes(r.v0, r.v1), w = sizes(r.w0, r.w1);
             const Vectors size = plus(plus(u, v), w);
             const Doubles extent = most(most(size.x, size.y), size.z);
-            bound = roundoff * (coplanarity_error * dot(w, uv) + underflow) + flushed * extent * extent;
-            trusted = bits(extent < largest_size);
+            decided = signs_of(bound_of(u, v, w, size, extent)) & bits(extent < largest_size);
         }
-        unsure &= ~(bits((lowest_k > bound) | (highest_k < -bound)) & trusted);
-        if (!unsure)
-            continue;
-    }
-
-    // separating direction
-    const Vectors us = plus(u0, u1), vs = plus(v0, v1), ws = plus(w0, w1);
-    const Vectors direction =
-        vertex_face ? minus(ws, times(1.0 / 3.0, plus(us, vs))) : plus(ws, times(0.5, minus(vs, us)));
-    const Doubles du0 = dot(direction, u0), du1 = dot(direction, u1), zero = 0.0;
-    const Doubles dv0 = dot(direction, v0), dv1 = dot(direction, v1);
-    const Doubles dw0 = dot(direction, w0), dw1 = dot(direction, w1);
-    Doubles lowest, highest;
-    if (vertex_face) {
-        lowest = least(dw0 - most(most(du0, dv0), zero), dw1 - most(most(du1, dv1), zero));
-        highest = most(dw0 - least(least(du0, dv0), zero), dw1 - least(least(du1, dv1), zero));
-    } else {
-        lowest = least(dw0 - most(du0, zero) + least(dv0, zero), dw1 - most(du1, zero) + least(dv1, zero));
-        highest = most(dw0 - least(du0, zero) + most(dv0, zero), dw1 - least(du1, zero) + most(dv1, zero));
-    }
-    if (bits((lowest > 0.0) | (highest < 0.0)) & unsure) {
-        Doubles slack = 0.0;
-        int trusted = 255;
-        if (roundoff > 0.0) {
-            const Vectors along = sizes(direction, direction);
-            const Vectors size = plus(plus(sizes(u0, u1), sizes(v0, v1)), sizes(w0, w1));
-            slack =
-                roundoff * (direction_error * dot(along, size) + underflow) + flushed * (along.x + along.y + along.z);
-            trusted = bits(most(most(size.x, size.y), size.z) < largest_size);
-        }
-        unsure &= ~(bits((lowest > slack) | (highest < -slack)) & trusted);
-    }
+        unsure &= ~decided;
+    };
+    const Cubic k = coefficients(r).k;
+    decide([&](Doubles bound) { return one_sign(k, bound); },
+           [&](Vectors u, Vectors v, Vectors w, Vectors, Doubles extent) {
+               return roundoff * (coplanarity_error * dot(w, cross_size(u, v)) + underflow) + flushed * extent * extent;
+           });
+    if (!unsure)
+        continue;
+    const Vectors direction = centroid_direction(r);
+    const Gaps gaps = gaps_along(r, direction);
+    decide([&](Doubles bound) { return bits((gaps.low > bound) | (gaps.high < -bound)); },
+           [&](Vectors, Vectors, Vectors, Vectors size, Doubles) {
+               const Vectors along = sizes(direction, direction);
+               return gap_bound(size, direction) + flushed * (along.x + along.y + along.z);
+           });
     for (int lane = 0; lane < filled; ++lane)
         left |= (unsigned long long)((unsure >> lane) & 1) << near[begin + lane];
 }

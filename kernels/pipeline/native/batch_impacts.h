@@ -1,10 +1,7 @@
 // The body of impact_batch; after simd_query.h.
 
 auto mix = [](Doubles a, Doubles b, Doubles t) { return (1.0 - t) * a + t * b; };
-auto mix_vector = [](Vectors a, Vectors b, Doubles t) {
-    const Doubles s = 1.0 - t;
-    return Vectors{s * a.x + t * b.x, s * a.y + t * b.y, s * a.z + t * b.z};
-};
+auto mix_vector = [=](Vectors a, Vectors b, Doubles t) { return plus(times(1.0 - t, a), times(t, b)); };
 auto restrict_quadratic = [&](Vectors q, Doubles start, Doubles end) {
     const Doubles s01 = mix(q.x, q.y, start), s12 = mix(q.y, q.z, start);
     const Doubles e01 = mix(q.x, q.y, end), e12 = mix(q.y, q.z, end);
@@ -15,9 +12,6 @@ auto restrict_cubic = [&](Cubic k, Doubles start, Doubles end) {
     const Vectors at_end = {mix(k.k0, k.k1, end), mix(k.k1, k.k2, end), mix(k.k2, k.k3, end)};
     const Vectors from_start = restrict_quadratic(at_start, start, end);
     return Cubic{from_start.x, from_start.y, from_start.z, restrict_quadratic(at_end, start, end).z};
-};
-auto lanes_of = [](int lanes) -> Longs {
-    return -__builtin_convertvector(__builtin_bit_cast(Bools, (unsigned char)lanes), Longs);
 };
 
 auto restrict_motion = [&](const Motion& m, Doubles start, Doubles end) {
@@ -34,12 +28,9 @@ struct Query {
 };
 
 // status of some lanes over a part of the time
-struct Found {
-    int free, hit;
-};
-auto status_between = [&](const Query& query, Cubic k, Doubles start, Doubles end, int lanes) -> Found {
+auto status_between = [&](const Query& query, Cubic k, Doubles start, Doubles end, int lanes) -> Status {
     const Doubles k_bound = cubic_error * query.y.bound;
-    Found found = {known(cubic_sign(k, k_bound)) & lanes, 0};
+    Status found = {one_sign(k, k_bound) & lanes, 0};
     lanes &= ~found.free;
     if (!lanes)
         return found;
@@ -55,7 +46,7 @@ auto status_between = [&](const Query& query, Cubic k, Doubles start, Doubles en
             tests.q[i] = restrict_quadratic(tests.q[i], start, end);
             tests.bounds[i] = quadratic_error * tests.bounds[i];
         }
-        const Verdict verdict = constant_verdict(tests);
+        const Status verdict = constant_verdict(tests);
         found.free |= verdict.free & lanes;
         found.hit |= verdict.hit & crossing & lanes;
         lanes &= ~(verdict.free | verdict.hit);
@@ -102,9 +93,8 @@ auto approximate_extremum = [&](Cubic k) -> Doubles {
 
 auto approximate_meeting_time = [&](const Motion& m, Doubles start, Doubles end) -> Doubles {
     const Motion part = restrict_motion(m, start, end);
-    Vectors direction = between(closest_coordinates(part.u0, part.v0, part.w0), part.u0, part.v0, part.w0);
-    if (!vertex_face)
-        direction = Vectors{-direction.x, -direction.y, -direction.z};
+    const Vectors gap = between(closest_coordinates(part.u0, part.v0, part.w0), part.u0, part.v0, part.w0);
+    const Vectors direction = vertex_face ? gap : times(-1.0, gap);
     const Doubles u0 = dot(direction, part.u0), v0 = dot(direction, part.v0), w0 = dot(direction, part.w0);
     const Doubles u1 = dot(direction, part.u1), v1 = dot(direction, part.v1), w1 = dot(direction, part.w1);
     Doubles time = 1.0;
@@ -113,16 +103,57 @@ auto approximate_meeting_time = [&](const Motion& m, Doubles start, Doubles end)
     };
     first_crossing(w0, w1);
     first_crossing(w0 - u0, w1 - u1);
-    if (vertex_face) {
-        first_crossing(w0 - v0, w1 - v1);
-    } else {
-        first_crossing(w0 + v0, w1 + v1);
+    first_crossing(vertex_face ? w0 - v0 : w0 + v0, vertex_face ? w1 - v1 : w1 + v1);
+    if (!vertex_face)
         first_crossing(w0 - u0 + v0, w1 - u1 + v1);
-    }
     return time;
 };
 
-unsigned long long open = 0;
+// the lanes whose features touch, but nowhere with strict signs, see batch_impacts.py
+auto touching = [&](const Scalars* points, const Query& query, int lanes) -> int {
+    typedef decltype(Scalars() == Scalars()) Words;
+    auto alike = [&](int axis, int a, int b) -> Words {
+        auto word = [&](int point) { return __builtin_bit_cast(Words, points[3 * point + axis]); };
+        return (word(a) == word(b)) & (word(a + 4) == word(b + 4));
+    };
+    constexpr int tests_of_borders = vertex_face ? 3 : 4, omitted[2][4] = {{1, 0, 3, 2}, {2, 3, 1}};
+    Vectors n = plus(plus(plus(query.y.n0, query.y.nh), query.y.nh), query.y.n1);
+    int zero[4] = {}, planar = 0, rest = lanes;
+    for (int axis = 0; axis < 3; ++axis) {
+        int here = 0, all = rest;
+        for (int i = 0; i < tests_of_borders; ++i) {
+            const int a = (omitted[vertex_face][i] + 1) % 4, b = (a + 1) % 4, c = (a + 2) % 4;
+            const int in_plane = bits(alike(axis, a, b) & alike(axis, b, c)) & rest;
+            zero[i] |= in_plane, here |= in_plane, all &= in_plane;
+        }
+        // the axis of the tests is another one or, if all four points are in the plane, this one
+        Doubles* of_n[3] = {&n.x, &n.y, &n.z};
+        for (int other = 0; other < 3; ++other)
+            *of_n[other] = where(lanes_of(other == axis ? here & ~all : all), Doubles(0.0), *of_n[other]);
+        planar |= all;
+        rest &= ~here;
+    }
+    if (rest == lanes)
+        return 0;
+    const Axes axes = largest_axis(n);
+    const InsideTests tests = inside_tests(query.motion, query.y, axes);
+    Curve curve = curve_of(query.y.k, query.y.bound);
+    const Shape shape = curve_class(curve);
+    curve.one = product(curve.start, sign(curve.k.k3, curve.bound)).negative & (shape.monotone | shape.extremum) &
+                bits(component(n, axes) != 0.0) & lanes & ~rest;
+    Signs start[4], end[4], at_root[4];
+    for (int i = 0; i < 4; ++i) {
+        const Vectors q = tests.q[i];
+        const Doubles bound = tests.bounds[i];
+        const int others = curve.one & ~zero[i];
+        const Signs s = quadratic_signs(q, bound, curve, chord_signs(q, bound, curve, others), others).first;
+        at_root[i] = {s.positive | zero[i], s.negative | zero[i]};
+        start[i] = sign(q.x, bound), end[i] = sign(q.z, bound);
+    }
+    return (curve.one & verdict(at_root).hit) | (planar & (verdict(start).hit | verdict(end).hit));
+};
+
+unsigned long long open = 0, touched = 0;
 Query packets[batch / 8];
 int entries[batch], entry_count = 0;
 for (int i = 0; i < count; ++i) {
@@ -132,20 +163,18 @@ for (int i = 0; i < count; ++i) {
 int queue[batch], queued = 0;  // the entries whose search has not begun
 for (int begin = 0; begin < entry_count; begin += 8) {
     const int filled = entry_count - begin < 8 ? entry_count - begin : 8;
-    int slots[8];
-    for (int lane = 0; lane < 8; ++lane)
-        slots[lane] = first + entries[begin + (lane < filled ? lane : 0)];
     Scalars points[24];
-    read_points(slots, points);
+    read_points([&](int lane) { return first + entries[begin + (lane < filled ? lane : 0)]; }, points);
     int usable = (1 << filled) - 1;
     Query& query = packets[begin / 8];
     query.motion = scaled_motion(points, usable);
     query.y = coplanarity(query.motion);
+    const int touches = timed ? 0 : touching(points, query, usable);
     for (int lane = 0; lane < filled; ++lane) {
-        if ((usable >> lane) & 1)
+        if ((usable & ~touches) >> lane & 1)
             queue[queued++] = begin + lane;
         else
-            open |= 1ull << entries[begin + lane];
+            ((touches >> lane & 1) ? touched : open) |= 1ull << entries[begin + lane];
     }
 }
 
@@ -182,18 +211,15 @@ for (;;) {
     const Doubles high = where(in_probe, least(root + shortest, end), end);
     const Cubic k = restrict_cubic(query.y.k, low, high);
     const int known_hit = certain & ~begun;
-    Found current = status_between(query, k, low, high, running & ~known_hit);
+    Status current = status_between(query, k, low, high, running & ~known_hit);
     current.hit |= known_hit;
     begun |= running;
     const int unsure = running & ~(current.free | current.hit);
     const Doubles half = shortest * __builtin_elementwise_floor(0.5 * width / shortest);
 
     const int probe_unsure = probing & unsure, probe_done = probing & running & ~unsure;
-    const int others = running & ~probing;
-    const int found = others & current.hit & bits(width <= length);
-    const int passed = others & current.free;
-    const int over = passed & bits(end == 1.0);
-    const int go_on = passed & ~over;
+    const int others = running & ~probing, found = others & current.hit & bits(width <= length);
+    const int passed = others & current.free, over = passed & bits(end == 1.0), go_on = passed & ~over;
     int search = others & ~(found | passed);
     const Doubles k_size = most(most(absolute(k.k0), absolute(k.k1)), most(absolute(k.k2), absolute(k.k3)));
     const Longs is_planar = k_size <= cubic_error * query.y.bound;
@@ -204,10 +230,8 @@ for (;;) {
 
     Doubles next_start = where(lanes_of(go_on), end, start), next_end = end;
     if (go_on) {
-        const Longs doubled = ~lanes_of(halved);
-        Doubles step = where(doubled, width + width, width);
-        step = where(lanes_of(ahead), Doubles(length), step);
-        const Doubles one = 1.0;
+        const Doubles one = 1.0, ahead_by = length;
+        const Doubles step = where(lanes_of(ahead), ahead_by, where(lanes_of(halved), width, width + width));
         const Doubles until = where(lanes_of(passing), one, least(next_start + step, one));
         next_end = where(lanes_of(go_on), until, next_end);
     }
@@ -279,8 +303,7 @@ auto contact_at = [&](const Motion& m, Doubles t, Coordinates& at) -> Vectors {
     normal = select(dot(normal, normal) <= flat * dot(unit_u, unit_u) * dot(unit_v, unit_v), velocity, normal);
     const Doubles zero = 0.0, one = 1.0;
     normal = select(dot(normal, normal) == 0.0, Vectors{zero, zero, one}, normal);
-    const Longs along = dot(normal, velocity) > 0.0;
-    normal = select(along, Vectors{-normal.x, -normal.y, -normal.z}, normal);
+    normal = select(dot(normal, velocity) > 0.0, times(-1.0, normal), normal);
     const Doubles size = __builtin_elementwise_sqrt(dot(normal, normal));
     return Vectors{normal.x / size, normal.y / size, normal.z / size};
 };
@@ -297,7 +320,7 @@ for (int begin = 0; begin < entry_count; begin += 8) {
     }
     for (int lane = 0; lane < filled; ++lane) {
         const int i = first + entries[begin + lane], e = begin + lane;
-        if ((open >> entries[e]) & 1)
+        if (((open | touched) >> entries[e]) & 1)
             continue;
         if (outcome[e] != UNSURE)
             status.data[i] = outcome[e];
@@ -312,4 +335,4 @@ for (int begin = 0; begin < entry_count; begin += 8) {
         normal.data[i] = Point(normals.x[lane], normals.y[lane], normals.z[lane]);
     }
 }
-return open;
+return {open, touched};

@@ -47,12 +47,12 @@ auto both = [](const Scalar* a, const Scalar* b, bool has_fourth) -> Scalars {
     return Scalars{a[0], a[1], a[2], 0, b[0], b[1], b[2], 0};
 };
 
-// reads the points of the pairs in eight slots, transposed to the coordinates of all eight
-auto read_points = [&](const int* slots, Scalars* points) {
+// reads the points of the pairs in the slots of eight lanes, transposed to the coordinates of all eight
+auto read_points = [&](auto slot, Scalars* points) {
     int corners[4][8], largest = 0;
     for (int lane = 0; lane < 8; ++lane) {
         int corner[4];
-        corners_of(slots[lane], corner);
+        corners_of(slot(lane), corner);
         for (int i = 0; i < 4; ++i) {
             corners[i][lane] = corner[i];
             largest = corner[i] > largest ? corner[i] : largest;

@@ -15,14 +15,18 @@ auto chosen = [](int lanes, Signs a, Signs b) {
     return Signs{(a.positive & lanes) | (b.positive & ~lanes), (a.negative & lanes) | (b.negative & ~lanes)};
 };
 auto where = [](Longs lanes, Doubles a, Doubles b) { return lanes ? a : b; };
+auto lanes_of = [](int lanes) -> Longs {
+    return -__builtin_convertvector(__builtin_bit_cast(Bools, (unsigned char)lanes), Longs);
+};
 
 struct Cubic {
     Doubles k0, k1, k2, k3;
 };
-auto cubic_sign = [=](Cubic k, Doubles bound) {
+// the lanes in which all coefficients certainly have one sign
+auto one_sign = [=](Cubic k, Doubles bound) -> int {
     const Doubles low = least(least(k.k0, k.k1), least(k.k2, k.k3));
     const Doubles high = most(most(k.k0, k.k1), most(k.k2, k.k3));
-    return Signs{bits(low > bound), bits(high < -bound)};
+    return bits((low > bound) | (high < -bound));
 };
 // a quadratic has its Bernstein coefficients in x, y and z
 auto quadratic_sign = [=](Vectors q, Doubles bound) {
@@ -42,8 +46,7 @@ struct Motion {
 auto scaled_motion = [&](const Scalars* points, int& usable) -> Motion {
     Relative r = relative(points);
     Vectors u = sizes(r.u0, r.u1), v = sizes(r.v0, r.v1), w = sizes(r.w0, r.w1);
-    auto largest = [=](Vectors a) { return most(a.x, most(a.y, a.z)); };
-    const Doubles size = most(largest(u), most(largest(v), largest(w)));
+    const Doubles size = most(largest_of(u), most(largest_of(v), largest_of(w)));
     usable &= bits((size >= 0x1p-480) & (size < 0x1p1023));
     if constexpr (sizeof(Scalar) == 4) {
         typedef float Floats __attribute__((ext_vector_type(8)));
@@ -59,22 +62,28 @@ auto scaled_motion = [&](const Scalars* points, int& usable) -> Motion {
     return {times(scale, r.u0), times(scale, r.v0), times(scale, r.w0), times(scale, r.u1), times(scale, r.v1),
             times(scale, r.w1), times(scale, u),    times(scale, v),    times(scale, w),    scale};
 };
-
 auto cross_size = [](Vectors a, Vectors b) {
     return Vectors{a.y * b.z + a.z * b.y, a.z * b.x + a.x * b.z, a.x * b.y + a.y * b.x};
 };
-struct Coplanarity {
+// the cubic of a motion, or of one that is not scaled, and the coefficients of the normal
+struct Coefficients {
     Cubic k;
-    Doubles bound;
-    Vectors n0, nh, n1, uv;
+    Vectors n0, nh, n1;
 };
-auto coplanarity = [&](const Motion& m) -> Coplanarity {
+auto coefficients = [=](const auto& m) -> Coefficients {
     const Vectors n0 = cross(m.u0, m.v0), n1 = cross(m.u1, m.v1);
     const Vectors nh = times(0.5, plus(cross(m.u0, m.v1), cross(m.u1, m.v0)));
-    const Vectors uv = cross_size(m.u_size, m.v_size);
     const Cubic k = {dot(m.w0, n0), (2.0 * dot(m.w0, nh) + dot(m.w1, n0)) * (1.0 / 3.0),
                      (2.0 * dot(m.w1, nh) + dot(m.w0, n1)) * (1.0 / 3.0), dot(m.w1, n1)};
-    return {k, roundoff * (coplanarity_error * dot(m.w_size, uv) + underflow), n0, nh, n1, uv};
+    return {k, n0, nh, n1};
+};
+struct Coplanarity : Coefficients {
+    Doubles bound;
+    Vectors uv;
+};
+auto coplanarity = [&](const Motion& m) -> Coplanarity {
+    const Vectors uv = cross_size(m.u_size, m.v_size);
+    return {coefficients(m), roundoff * (coplanarity_error * dot(m.w_size, uv) + underflow), uv};
 };
 
 // the lanes in which axis 1 and axis 2 are chosen; axis 0 in the others
@@ -135,11 +144,12 @@ auto inside_tests = [&](const Motion& m, const Coplanarity& y, Axes axes) -> Ins
     return tests;
 };
 
-// the lanes that the signs of the inside tests show to be free, and those that they show to be hits
-struct Verdict {
+// the lanes that are certainly free, and those that are certainly hits
+struct Status {
     int free, hit;
 };
-auto verdict = [](const Signs* s) -> Verdict {
+// by the signs of the inside tests
+auto verdict = [](const Signs* s) -> Status {
     const int above = s[0].positive | s[1].positive | s[2].positive | s[3].positive;
     const int below = s[0].negative | s[1].negative | s[2].negative | s[3].negative;
     return {above & below, (s[0].positive & s[1].positive & s[2].positive & s[3].positive) |
@@ -193,9 +203,9 @@ auto between = [=](Coordinates c, Vectors u, Vectors v, Vectors w) {
 
 // by how much a direction separates the features at both ends, on either side
 struct Gaps {
-    Doubles low, high, bound;
+    Doubles low, high;
 };
-auto gaps_along = [=](const Motion& m, Vectors direction) -> Gaps {
+auto gaps_along = [=](const auto& m, Vectors direction) -> Gaps {
     const Doubles u0 = dot(direction, m.u0), v0 = dot(direction, m.v0), w0 = dot(direction, m.w0);
     const Doubles u1 = dot(direction, m.u1), v1 = dot(direction, m.v1), w1 = dot(direction, m.w1), zero = 0.0;
     Doubles low, high;
@@ -206,11 +216,19 @@ auto gaps_along = [=](const Motion& m, Vectors direction) -> Gaps {
         low = least(w0 - most(u0, zero) + least(v0, zero), w1 - most(u1, zero) + least(v1, zero));
         high = most(w0 - least(u0, zero) + most(v0, zero), w1 - least(u1, zero) + most(v1, zero));
     }
-    const Doubles size = dot(sizes(direction, direction), plus(plus(m.u_size, m.v_size), m.w_size));
-    return {low, high, roundoff * (direction_error * size + underflow)};
+    return {low, high};
+};
+auto gap_bound = [=](Vectors size, Vectors direction) {
+    return roundoff * (direction_error * dot(sizes(direction, direction), size) + underflow);
+};
+// the direction through the centroids at half time
+auto centroid_direction = [=](const auto& m) {
+    const Vectors u = plus(m.u0, m.u1), v = plus(m.v0, m.v1), w = plus(m.w0, m.w1);
+    return vertex_face ? minus(w, times(1.0 / 3.0, plus(u, v))) : plus(w, times(0.5, minus(v, u)));
 };
 // the lanes in which a direction certainly separates the features at both ends, on the same side
 auto direction_separates = [=](const Motion& m, Vectors direction) -> int {
     const Gaps gaps = gaps_along(m, direction);
-    return bits((gaps.low > gaps.bound) | (gaps.high < -gaps.bound));
+    const Doubles bound = gap_bound(plus(plus(m.u_size, m.v_size), m.w_size), direction);
+    return bits((gaps.low > bound) | (gaps.high < -bound));
 };

@@ -39,8 +39,9 @@ def random_limbs(rng, n, limbs):
     x = rng.integers(0, 2**64, (n, 4, limbs), dtype=np.uint64)
     ends = rng.choice(np.array([0, 1, 2**63, 2**63 - 1, 2**64 - 1], dtype=np.uint64), (n, 4, limbs))
     x = np.where(rng.random((n, 4, limbs)) < rng.choice([0.0, 0.5, 1.0], (n, 4, 1)), ends, x)
-    small = rng.random((n, 4)) < 0.3
-    x[small, 1:] = np.where(rng.random(small.sum()) < 0.5, np.uint64(0), np.uint64(2**64 - 1))[:, None]
+    for used in (1, 2):
+        small = rng.random((n, 4)) < 0.2
+        x[small, used:] = np.where(rng.random(small.sum()) < 0.5, np.uint64(0), np.uint64(2**64 - 1))[:, None]
     return x
 
 

@@ -18,7 +18,7 @@ from ...kernels.pipeline.batch_impacts import BATCH as DECIDED
 from ...kernels.pipeline.batch_impacts import impact_batch_of
 from ...kernels.pipeline.queues import filled_entries, raise_count, take_slots, write
 from ...kernels.polynomials import coplanarity
-from ...kernels.signs import FREE, UNSURE
+from ...kernels.signs import FREE, HIT, UNSURE
 from ...kernels.time_of_impact import clamped_tolerance, impact, power_of_two
 from ..run.launch import made_once
 from ..run.settings import NO_FUSED_OPERATIONS, Count, PairKind
@@ -141,28 +141,26 @@ def batch_classification_kernel(kind: PairKind, dtype: type) -> wp.Kernel:
 
 
 @wp.func
-def _decide_batch(first: int, count: int, timed: bool, buffers: PairBuffers):
+def _decide_batch(first: int, count: int, timed: bool, touching: wp.uint64, buffers: PairBuffers):
     """Decides contacts as the kernel of a GPU does, with one atomic operation for each count."""
     contacts = buffers.contacts
     found = int(0)
     unsure = int(0)
-    for_exact = int(0)
+    queued = int(0)
     for i in range(first, first + count):
-        status = contacts.status[i]
-        write_decision(i, int(status), buffers)
-        if status != wp.int8(FREE):
-            found += 1
-            if status == wp.int8(UNSURE):
-                unsure += 1
-            if status == wp.int8(UNSURE) or (timed and not contacts.within_tolerance[i]):
-                for_exact += 1
+        status = int(contacts.status[i])
+        is_touching = (touching >> wp.uint64(i - first)) & wp.uint64(1) == wp.uint64(1)
+        write_decision(i, wp.where(is_touching, HIT, status), buffers)
+        found += int(status != FREE)
+        unsure += int(status == UNSURE)
+        queued += int(status == UNSURE or (status == HIT and timed and not contacts.within_tolerance[i]))
     raise_count(buffers.counts, Count.FOUND, found)
     raise_count(buffers.counts, Count.UNSURE, unsure)
-    if for_exact > 0:
-        slot = wp.int32(take_slots(buffers.counts, Count.FOR_EXACT, for_exact))
+    if queued > 0:
+        slot = wp.int32(take_slots(buffers.counts, Count.FOR_EXACT, queued))
         for i in range(first, first + count):
-            status = contacts.status[i]
-            if status == wp.int8(UNSURE) or (status != wp.int8(FREE) and timed and not contacts.within_tolerance[i]):
+            status = int(contacts.status[i])
+            if status == UNSURE or (status == HIT and timed and not contacts.within_tolerance[i]):
                 buffers.for_exact[slot] = i
                 slot += 1
 
@@ -188,7 +186,7 @@ def batch_impact_kernel(kind: PairKind, dtype: type) -> wp.Kernel:
         contacts = buffers.contacts
         i = DECIDED * (first + wp.tid())
         number = wp.min(DECIDED, filled_entries(contacts.pairs, buffers.counts, Count.CONTACTS) - i)
-        left = impact_batch(
+        masks = impact_batch(
             x0,
             x1,
             buffers.elements,
@@ -204,13 +202,13 @@ def batch_impact_kernel(kind: PairKind, dtype: type) -> wp.Kernel:
             contacts.coordinates,
             contacts.normal,
         )
-        while left != wp.uint64(0):
-            row = i + lowest_bit(left)
+        while masks[0] != wp.uint64(0):
+            row = i + lowest_bit(masks[0])
             v = vertices_of_pair(kind_number, buffers.elements, contacts.pairs[row])
             a0, b0, c0, d0, a1, b1, c1, d1 = ends_of(x0, x1, v)
             motion = relative_motion(kind_number, a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
             write_impact(row, impact(motion, coplanarity(motion), int(contacts.status[row]), tolerance), buffers)
-            left = left & (left - wp.uint64(1))
-        _decide_batch(i, number, timed, buffers)
+            masks[0] = masks[0] & (masks[0] - wp.uint64(1))
+        _decide_batch(i, number, timed, masks[1], buffers)
 
     return find_impact_batches

@@ -21,7 +21,7 @@ class ContactBuffer:
     Attributes:
         pairs: (vertex, face) or (edge, edge).
         status: What floating point certifies: FREE, HIT or UNSURE.
-        decided: The status after the exact phase, if the method has one; UNSURE for contacts delegated to the host.
+        decided: The status after the exact phase, or HIT where features certainly touch; UNSURE if left to the host.
         within_tolerance: Whether the time of impact is within the tolerance.
         toi: Time of impact as a share of the step.
         coordinates: Contact coordinates.

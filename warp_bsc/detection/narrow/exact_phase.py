@@ -70,6 +70,8 @@ def _kernel(dtype: type, limbs: int) -> wp.Kernel:
             return
         i = queue[slot]
         contacts = buffers.contacts
+        if not timed and contacts.decided[i] == wp.int8(HIT):
+            return
         v = vertices_of_pair(kind, buffers.elements, contacts.pairs[i])
         query = query_at(x0, x1, v)
         time = decide(kind, query, timed, digits)
