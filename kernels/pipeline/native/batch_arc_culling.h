@@ -25,8 +25,7 @@ auto read_packet = [&](const int* which, int filled) -> Packet {
     Doubles distance;
     for (int lane = 0; lane < 8; ++lane) {
         slots[lane] = first + which[lane < filled ? lane : 0];
-        int corner[4];
-        corners_of(slots[lane], corner);
+        const Four corner = corners_of(slots[lane]);
         const double* of = (const double*)deviation.data;
         const double a = of[corner[0]], b = of[corner[1]], other = larger_of(of[corner[2]], of[corner[3]]);
         distance[lane] = vertex_face ? a + larger_of(b, other) : larger_of(a, b) + other;

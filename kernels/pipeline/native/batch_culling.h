@@ -9,10 +9,8 @@ for (int i = 0; i < count; ++i) {
         ++near_count;
         continue;
     }
-    int corner[4];
-    corners_of(first + i, corner);
-    auto later = [](int a, int b) { return a > b ? a : b; };
-    const bool has_fourth = later(later(corner[0], corner[1]), later(corner[2], corner[3])) < last;
+    const Four corner = corners_of(first + i);
+    const bool has_fourth = __builtin_reduce_max(corner) < last;
     auto ends = [&](int i) { return both(position(x0, corner[i]), position(x1, corner[i]), has_fourth); };
     const Scalars a = ends(0), b = ends(1), c = ends(2), d = ends(3);
     Scalars low = a, high = a;

@@ -18,12 +18,12 @@ auto load = [&](const auto& x, int corner) -> Four {
         return *(const Loaded*)from;
     return Four{from[0], from[1], from[2], 0};
 };
-// to single precision, to nearest: rounding and clamping keep order
+// to single precision, to nearest: rounding and clamping keep order; -0 becomes 0
 auto rounded = [](Four x, double pad) {
     const Doubles largest = 3.4028234663852886e38;
     const Doubles moved = __builtin_convertvector(x, Doubles) + pad;
     const Doubles clamped = __builtin_elementwise_max(__builtin_elementwise_min(moved, largest), -largest);
-    return __builtin_convertvector(clamped, Row);
+    return __builtin_convertvector(clamped, Row) + 0.0f;
 };
 
 float rows[12][8];
