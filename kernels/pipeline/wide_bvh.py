@@ -21,7 +21,7 @@ import warp as wp
 from ..native_text import definitions, header
 
 
-@wp.func_native(snippet=header(__file__, "pair_packet.h"))
+@wp.func_native(snippet=header(__file__, "append.h") + header(__file__, "pair_packet.h"))
 def pair_packet(
     packet: int,
     # tree of the packet

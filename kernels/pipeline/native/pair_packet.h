@@ -1,4 +1,4 @@
-// The body of pair_packet.
+// The body of pair_packet; after append.h.
 
 typedef float Floats __attribute__((ext_vector_type(8), aligned(4)));
 typedef int Ints __attribute__((ext_vector_type(8), aligned(4)));
@@ -9,21 +9,6 @@ auto floats = [](const float* at) { return *(const Floats*)at; };
 auto ints = [](const int* at) { return *(const Ints*)at; };
 auto bits = [](Ints mask) -> unsigned {
     return __builtin_bit_cast(unsigned char, __builtin_convertvector(mask, Bools));
-};
-
-// adds the values in some lanes to a list that has room for all of them; without a branch, as their number is hard to
-// predict
-auto append = [](auto* list, int& count, auto values, unsigned lanes) {
-#ifdef __AVX512VL__
-    if constexpr (sizeof(values) == sizeof(Longs))
-        *(Longs*)(list + count) = __builtin_ia32_compressdi512_mask(values, values, lanes);
-    else
-        *(Ints*)(list + count) = __builtin_ia32_compresssi256_mask(values, values, lanes);
-    count += __builtin_popcount(lanes);
-#else
-    for (; lanes; lanes &= lanes - 1)
-        list[count++] = values[__builtin_ctz(lanes)];
-#endif
 };
 
 const float* box = boxes.data + 96 * (size_t)packet;
@@ -103,7 +88,7 @@ auto compare = [&]() {
         unsigned meets = bits(meeting(other_boxes.data + 96 * (size_t)near[i], whole));
         if (!changed)
             meets &= bits(ints(other_elements.data + 48 * (size_t)near[i] + 40) != 0);
-        append(others, other_count, 8 * near[i] + lanes, meets);
+        other_count += append(others + other_count, 8 * near[i] + lanes, meets);
     }
     near_count = 0;
     for (int i = 0; i < other_count; ++i) {
@@ -133,8 +118,8 @@ auto compare = [&]() {
         const Ints a = ints(element), b = other_element[0];
         const Ints first = ordered ? __builtin_elementwise_min(a, b) : a;
         const Ints second = ordered ? __builtin_elementwise_max(a, b) : b;
-        append(found, count, __builtin_convertvector(first, Longs) | (__builtin_convertvector(second, Longs) << 32),
-               mask);
+        const Longs both = __builtin_convertvector(first, Longs) | (__builtin_convertvector(second, Longs) << 32);
+        count += append(found + count, both, mask);
     }
 };
 
@@ -153,9 +138,9 @@ while (height > 0) {
         overlap &= children >= packet >> (3 * level);
     overlap &= meeting(child, whole);
     if (level > 0)
-        append(stack, height, 16 * children + level - 1, bits(overlap));
+        height += append(stack + height, 16 * children + level - 1, bits(overlap));
     else
-        append(near, near_count, children, bits(overlap));
+        near_count += append(near + near_count, children, bits(overlap));
     if (near_count > most_near - 8 || height == 0)
         compare();
 }

@@ -4,6 +4,7 @@ typedef Scalar Scalars __attribute__((ext_vector_type(8)));
 typedef Scalar Loaded __attribute__((ext_vector_type(4), aligned(sizeof(Scalar))));
 typedef double Doubles __attribute__((ext_vector_type(8)));
 typedef decltype(Doubles() < Doubles()) Longs;
+typedef int Ints __attribute__((ext_vector_type(8)));
 typedef bool Bools __attribute__((ext_vector_type(8)));
 struct Vectors {
     Doubles x, y, z;
