@@ -12,7 +12,7 @@ import warp as wp
 
 from ...kernels.pairs import PairFilter
 from ...kernels.pipeline.wide_bvh import fit_packet_of, pair_packet
-from ..run.launch import launch_over, made_once
+from ..run.launch import launch_over, launch_together, made_once
 from ..run.settings import NO_GRADIENTS, Count
 
 _CODE_BITS = 10
@@ -217,6 +217,10 @@ def _join_nodes(
     node_marks[parent, 2, lane] = changed
 
 
+_Launch = tuple[wp.Kernel, int, list, list]
+"""An argument of :func:`.launch_together`."""
+
+
 class WideTree:
     """A wide BVH over the elements of one kind: vertices, edges or faces."""
 
@@ -262,6 +266,7 @@ class WideTree:
         self._elements = wp.full((packets, 48), -1, dtype=int, device=device)
         self._nodes = wp.array(np.tile(empty, (starts[-1], 6, 8)), dtype=wp.float32, device=device)
         self._node_marks = wp.full((starts[-1], 3, 8), -1, dtype=int, device=device)
+        self._starts = starts
         self._tree = tree = _Tree()
         tree.corners, tree.level_starts = corners.shape[1], wp.array(starts, dtype=int, device=device)
         for name in ("boxes", "elements", "nodes", "node_marks"):
@@ -288,22 +293,25 @@ class WideTree:
         launch_over(_fill_packets, len(self._boxes), inputs=inputs, outputs=outputs, device=device, chunk=2048)
         self._sorted_size, self.is_sorted = 0.0, True
 
-    def fit(self, x0: wp.array, x1: wp.array, changed: wp.array | None = None) -> None:
-        """Fits packets and nodes to a motion; arguments as of :meth:`.BroadPhaseHierarchy.pair_elements`."""
-        _, fit_packets = _kernels(x0.dtype)
-        inputs, device = [x0, x1, len(self._corners), changed, self._padding], self._corners.device
-        launch_over(fit_packets, len(self._boxes), inputs=inputs, outputs=[self._tree], device=device, chunk=2048)
-        starts = self._tree.level_starts.numpy().tolist()
-        rows = self._nodes.numpy()[: starts[1]].reshape(-1, 3, 4, 8)
+    def measure(self) -> None:
+        """Computes the size of all packets, after they were fitted."""
+        rows = self._nodes.numpy()[: self._starts[1]].reshape(-1, 3, 4, 8)
         with np.errstate(over="ignore"):
             sizes = np.maximum(rows[:, :, 1], rows[:, :, 3]) - np.minimum(rows[:, :, 0], rows[:, :, 2])
         self._size = float(np.clip(sizes, 0.0, np.finfo(np.float32).max).sum(dtype=np.float64))
         self._sorted_size = self._sorted_size or self._size
-        for start, above in itertools.pairwise(starts[:-1]):
-            inputs, outputs = [start, above], [self._nodes, self._node_marks]
-            launch_over(_join_nodes, above - start, inputs=inputs, outputs=outputs, device=device, chunk=2048)
 
-    def pair(
+    def fitting(self, x0: wp.array, x1: wp.array, changed: wp.array | None) -> _Launch:
+        """Returns the launch that fits packets; arguments as of :meth:`.BroadPhaseHierarchy.pair_elements`."""
+        _, fit_packets = _kernels(x0.dtype)
+        return fit_packets, len(self._boxes), [x0, x1, len(self._corners), changed, self._padding], [self._tree]
+
+    def joinings(self) -> list[_Launch]:
+        """Returns the launches that fit nodes, from the lowest level."""
+        nodes, levels = [self._nodes, self._node_marks], itertools.pairwise(self._starts[:-1])
+        return [(_join_nodes, above - start, [start, above], nodes) for start, above in levels]
+
+    def pairing(
         self,
         other: "WideTree",
         counts: wp.array,
@@ -313,8 +321,8 @@ class WideTree:
         keep_separated: bool = False,
         at_end: bool = False,
         filtered_of_worlds: wp.array | None = None,
-    ) -> None:
-        """Enqueues the candidates between this tree and another, or within this tree.
+    ) -> _Launch:
+        """Returns the launch that enqueues the candidates between this tree and another, or within this tree.
 
         Args:
             other: The other tree, or this tree.
@@ -325,11 +333,18 @@ class WideTree:
             at_end: Whether to enqueue the pairs that overlap at the end of the motion.
             filtered_of_worlds: Counts of the pairs that are left out, by world, array of int64; None for none.
         """
-        if not len(other._boxes):
-            return
         options = [self._filter, other is self, ordered, keep_separated, at_end]
         inputs = [self._tree, other._tree, *options, counts, filtered_of_worlds]
-        launch_over(_pair_packets, len(self._boxes), inputs=inputs, outputs=[pairs], device=pairs.device, chunk=64)
+        return _pair_packets, len(self._boxes) if len(other._boxes) else 0, inputs, [pairs]
+
+
+def fit_trees(trees: Sequence[WideTree], x0: wp.array, x1: wp.array, changed: wp.array | None) -> None:
+    """Fits packets and nodes of trees to a motion; arguments as of :meth:`.BroadPhaseHierarchy.pair_elements`."""
+    launch_together([tree.fitting(x0, x1, changed) for tree in trees], device=x0.device, chunk=256)
+    for level in itertools.zip_longest(*(tree.joinings() for tree in trees)):
+        launch_together([joining for joining in level if joining], device=x0.device, chunk=512)
+    for tree in trees:
+        tree.measure()
 
 
 def sort_trees(trees: Sequence[WideTree], x0: wp.array, x1: wp.array, used: np.ndarray | slice) -> None:

@@ -24,6 +24,7 @@ from ..run.launch import made_once
 from ..run.settings import NO_FUSED_OPERATIONS, Count, PairKind
 from .pair_kernels import PairBuffers, write_decision, write_impact
 
+
 @wp.func
 def _move_turning_pairs(kind: int, buffers: PairBuffers, arcs: Arcs, first: int, count: int) -> int:
     """Moves the pairs with a turning vertex to the end of a part of the queue, and returns the number of the others."""

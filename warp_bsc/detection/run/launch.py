@@ -170,13 +170,32 @@ def launch_over(
         options = {"max_blocks": max_blocks, "block_dim": block_dim, "record_tape": False}
         launch(kernel, count, inputs=[0, *inputs], outputs=outputs, device=device, **options)
         return
+    launch_together([(kernel, count, inputs, outputs)], device=device, chunk=chunk)
+
+
+def launch_together(
+    kernels: Sequence[tuple[wp.Kernel, int, list, list]], *, device: wp.Device, chunk: int = 1024
+) -> None:
+    """Launches kernels on all cores of the CPU, as :func:`launch_over` one, in no order: no core waits between them.
+
+    Args:
+        kernels: Kernels with their numbers of entries, their inputs after the first, and their outputs.
+        device: The CPU.
+        chunk: Entries that a core takes at a time, at least.
+    """
     if device.is_capturing:
         raise RuntimeError("a graph on the CPU cannot capture this, as the host reads results between launches")
-    if not count:
-        return
-    threads = cores_for(kernel, device)
-    chunk = max(chunk, -(-count // (8 * threads if threads > 1 else 1)))
-    _run(kernel, count, chunk, threads, inputs=[0, *inputs], outputs=outputs, device=device, has_first=True)
+    left = sum(count for _, count, _, _ in kernels)
+    threads = min((cores_for(kernel, device) for kernel, *_ in kernels), default=1)
+    parts = []
+    for kernel, count, inputs, outputs in kernels:
+        first, command = 0, _command(kernel, count, device, [0, *inputs], outputs) if count else None
+        while first < count:
+            # a share of what is left, so that the last parts are small, and all threads end at about the same time
+            part = min(count - first, max(chunk, -(-left // (2 * threads if threads > 1 else 1))))
+            parts.append((command, first, part))
+            first, left = first + part, left - part
+    _run(parts, threads)
 
 
 def launch_on_cores(
@@ -187,7 +206,8 @@ def launch_on_cores(
     if device.is_cuda or min(threads, count) <= 1:
         launch(kernel, count, inputs=inputs, outputs=outputs, device=device, block_dim=block_dim)
         return
-    _run(kernel, count, -(-count // (8 * threads)), threads, inputs=inputs, outputs=outputs, device=device)
+    command, part = _command(kernel, count, device, inputs, outputs), -(-count // (8 * threads))
+    _run([(command, None, min(part, count - first)) for first in range(0, count, part)], threads)
 
 
 def cores_for(kernel: wp.Kernel, device: wp.Device) -> int:
@@ -195,27 +215,33 @@ def cores_for(kernel: wp.Kernel, device: wp.Device) -> int:
     return _threads.get(count_cores()) if may_run_in_threads(kernel) and not device.is_capturing else 1
 
 
-def _run(kernel: wp.Kernel, count: int, chunk: int, threads: int, has_first: bool = False, **options: Any) -> None:
-    """Runs parts of a launch in this thread and, as soon as they are free, in others, so that short ones wait for none.
+def _command(kernel: wp.Kernel, count: int, device: wp.Device, inputs: list, outputs: Sequence[Any]) -> wp.Launch:
+    """Returns a launch with its arguments packed, which takes longer than many a part of it."""
+    with _loading(kernel, device, 0):
+        return wp.launch(kernel, count, inputs, outputs, device=device, record_tape=False, record_cmd=True)
 
-    The others only run commands: Warp cannot load a kernel and pack its arguments in several threads at once.
+
+def _run(parts: Sequence[tuple[wp.Launch, int | None, int]], threads: int) -> None:
+    """Runs parts of launches in this thread and, as soon as they are free, in others, so that short ones wait for none.
+
+    The others only run commands: Warp cannot load a kernel and pack arrays in several threads at once.
+
+    Args:
+        parts: Launches with the first argument of a part, None for that of all, and its number of threads.
+        threads: How many parts run at once.
     """
-    with _loading(kernel, options["device"], 0):
-        commands = [wp.launch(kernel, min(chunk, count), record_tape=False, record_cmd=True, **options)]
-    for first in range(chunk, count, chunk):  # to pack all arguments again would take longer than many a chunk
-        command = copy.copy(commands[0])
-        command.params = list(command.params)
-        if has_first:
-            command.set_param_at_index(0, first)
-        command.set_dim(min(chunk, count - first))
-        commands.append(command)
-    waiting = iter(commands)
+    waiting = iter(parts)
 
     def work() -> None:
-        for command in waiting:
+        for whole, first, count in waiting:
+            command = copy.copy(whole)
+            command.params = list(command.params)
+            if first is not None:
+                command.set_param_at_index(0, first)
+            command.set_dim(count)
             command.launch()
 
-    others = [thread_pool(threads).submit(work) for _ in range(min(threads, len(commands)) - 1)]
+    others = [thread_pool(threads).submit(work) for _ in range(min(threads, len(parts)) - 1)]
     try:
         work()
     finally:
