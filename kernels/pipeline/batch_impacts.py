@@ -42,7 +42,7 @@ def impact_batch_of(dtype: type, vertex_face: bool) -> wp.Function:
         only decides what is UNSURE. It returns a bit for each pair, set where the pair remains open. Indices are not
         checked.
     """
-    snippet = native_for_pairs(dtype, vertex_face, "simd_query.h", "batch_impacts.h", **_CONSTANTS)
+    snippet = native_for_pairs(dtype, vertex_face, "simd_query.h", "append.h", "batch_impacts.h", **_CONSTANTS)
 
     @wp.func_native(snippet)
     def impact_batch(
