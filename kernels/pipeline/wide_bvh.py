@@ -80,7 +80,7 @@ def fit_packet_of(dtype: type) -> wp.Function:
     """
     scalar = definitions({"Scalar": "float" if dtype is wp.vec3 else "double"})
 
-    @wp.func_native(scalar + header(__file__, "fit_packet.h"))
+    @wp.func_native(scalar + header(__file__, "positions.h") + header(__file__, "fit_packet.h"))
     def fit_packet(
         packet: int,
         count: int,
