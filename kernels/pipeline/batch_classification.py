@@ -1,7 +1,7 @@
 """The classification of many pairs at once, in SIMD packets of eight.
 
-It is :func:`warp_bsc.kernels.classification.classify`, operation by operation, so that it finds the same statuses. Pairs
-whose inside tests do not decide them alone are gathered in packets of their own, so that no lane is idle. It leaves open the few pairs whose cubic is to be split at its inflection, those that :mod:`.simd_query` cannot use,
+It is :func:`warp_bsc.kernels.classification.classify`, operation by operation, so that it finds the same statuses. It
+leaves open the few pairs whose cubic is to be split at its inflection, those that :mod:`.simd_query` cannot use,
 and with a roundoff of zero (method "float") those that remain unsure, whose zeros need more cases.
 """
 
@@ -14,11 +14,13 @@ from ..roots import ROOT_CONSTANTS
 from .simd import native_for_pairs
 from .simd_query import QUERY_CONSTANTS
 
-BATCH = wp.constant(64)
+BATCH = wp.constant(32)
 """Pairs that one call classifies."""
 
-_OWN_CONSTANTS = {"batch": int(BATCH), "split_error": float(SPLIT_ERROR), "tiny_share": float(TINY)}
-_CONSTANTS = QUERY_CONSTANTS | ROOT_CONSTANTS | _OWN_CONSTANTS
+OPEN = wp.constant(3)
+"""Stands for a status, where a pair remains open."""
+
+_CONSTANTS = QUERY_CONSTANTS | ROOT_CONSTANTS | {"split_error": float(SPLIT_ERROR), "tiny_share": float(TINY)}
 
 
 @functools.cache
@@ -32,10 +34,9 @@ def classify_batch_of(dtype: type, vertex_face: bool) -> wp.Function:
     Returns:
         Device function for the CPU. Its arguments are the positions at both ends, the vertices of the elements, a queue
         of pairs, the first pair of the batch, the number of pairs in it, at most :data:`BATCH`, and the roundoff. It
-        returns a bit for each pair in two numbers: set in the first for hits, in the second where it is not certain,
-        and in both where the pair remains open. Indices are not checked.
+        returns two bits for each pair: its status, or :data:`OPEN`. Indices are not checked.
     """
-    snippet = native_for_pairs(dtype, vertex_face, "simd_query.h", "append.h", "batch_classification.h", **_CONSTANTS)
+    snippet = native_for_pairs(dtype, vertex_face, "simd_query.h", "batch_classification.h", **_CONSTANTS)
 
     @wp.func_native(snippet)
     def classify_batch(
@@ -49,6 +50,6 @@ def classify_batch_of(dtype: type, vertex_face: bool) -> wp.Function:
         count: int,
         # rounding
         roundoff: wp.float64,
-    ) -> wp.vec2ul: ...
+    ) -> wp.uint64: ...
 
     return classify_batch

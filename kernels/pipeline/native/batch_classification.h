@@ -1,4 +1,4 @@
-// The body of classify_batch; after simd_query.h and append.h.
+// The body of classify_batch; after simd_query.h.
 
 auto evaluate_cubic = [](Cubic k, Doubles a, Doubles b) {
     return ((k.k0 * b + 3.0 * k.k1 * a) * b + 3.0 * k.k2 * a * a) * b + k.k3 * a * a * a;
@@ -152,18 +152,13 @@ auto classify_piece = [&](Curve y, const InsideTests& tests, int extremum, int l
     return status;
 };
 
-// the status where no inside test changes its sign
-auto constant_status = [&](Cubic k, Doubles bound, const InsideTests& tests) -> Status {
-    const Verdict constant = constant_verdict(tests);
-    const Signs ends = product(sign(k.k0, bound), sign(k.k3, bound));
-    return {constant.free, constant.hit & ends.negative & ~constant.free};
-};
-
-// the status in some lanes that constant_status leaves open
+// the status in some lanes, from the inside tests of their axis
 auto classify_with = [&](Cubic k, Doubles bound, const InsideTests& tests, int lanes) -> Status {
+    const Verdict constant = constant_verdict(tests);
     Curve curve = curve_of(k, bound);
-    Status status = {0, 0};
-    lanes &= known(curve.start) & known(sign(k.k3, bound));
+    const Signs ends = product(curve.start, sign(k.k3, bound));
+    Status status = {constant.free, constant.hit & ends.negative & ~constant.free};
+    lanes &= ~(status.free | status.hit) & known(ends);
     if (!lanes)
         return status;
     Shape shape = curve_class(curve);
@@ -229,67 +224,20 @@ auto without_zeros = [&](Cubic k) -> Cubic {
             where(k.k3 == 0.0, where(end < 0.0, -tiny, tiny), k.k3)};
 };
 
-// what remains to be classified, without and with two extrema of the cubic, so that the packets of either are full
-struct Question {
-    Cubic k;
-    Doubles bound;
-    InsideTests tests;
-};
-constexpr int rows = sizeof(Question) / sizeof(Doubles);
-struct Questions {
-    double rows[rows][batch + 8];
-    int numbers[batch + 8], count;
-};
-Questions questions[2];
-questions[0].count = questions[1].count = 0;
-
-const Ints lane_numbers = {0, 1, 2, 3, 4, 5, 6, 7};
-wp::uint64 hits = 0, unsures = 0;
+unsigned long long statuses = 0;
 for (int begin = 0; begin < count; begin += 8) {
     const int filled = count - begin < 8 ? count - begin : 8;
-    int slots[8];
-    for (int lane = 0; lane < 8; ++lane)
-        slots[lane] = first + begin + (lane < filled ? lane : 0);
-    Scalars points[24];
-    read_points(slots, points);
     const int all = (1 << filled) - 1;
     int usable = all;
-    const Motion motion = scaled_motion(points, usable);
+    const Motion motion = scaled_motion(read_points([&](int lane) { return first + begin + lane; }, filled), usable);
     const Coplanarity y = coplanarity(motion);
-    int left = usable & ~known(cubic_sign(y.k, y.bound)), hit = 0;
+    int free = known(cubic_sign(y.k, y.bound)), hit = 0, left = usable & ~free;
     if (left) {
-        const Axes axes = largest_axis(plus(plus(plus(y.n0, y.nh), y.nh), y.n1));
-        const Question question = {y.k, y.bound, inside_tests(motion, y, axes)};
-        const Status found = constant_status(y.k, y.bound, question.tests);
-        hit = found.hit & left;
-        left &= ~(found.free | hit);
-        const int two = left & curve_class(curve_of(y.k, y.bound)).two_extrema;
-        for (int kind = 0; kind < 2; ++kind) {
-            Questions& to = questions[kind];
-            const int lanes = kind ? two : left & ~two;
-            if (!lanes)
-                continue;
-            for (int i = 0; i < rows; ++i)
-                append(to.rows[i] + to.count, ((const Doubles*)&question)[i], lanes);
-            to.count += append(to.numbers + to.count, begin + lane_numbers, lanes);
-        }
-    }
-    const int open = all & ~usable;
-    hits |= (wp::uint64)(hit | open) << begin;
-    unsures |= (wp::uint64)(left | open) << begin;
-}
-
-for (const Questions& from : questions)
-    for (int begin = 0; begin < from.count; begin += 8) {
-        const int filled = from.count - begin < 8 ? from.count - begin : 8;
-        Question question;
-        for (int i = 0; i < rows; ++i)
-            __builtin_memcpy((Doubles*)&question + i, from.rows[i] + begin, sizeof(Doubles));
-        const InsideTests& tests = question.tests;
-        Cubic k = question.k;
-        int free = 0, hit = 0, left = (1 << filled) - 1, lanes = left;
+        const InsideTests tests = inside_tests(motion, y, largest_axis(plus(plus(plus(y.n0, y.nh), y.nh), y.n1)));
+        Cubic k = y.k;
+        int lanes = left;
         for (int attempt = 0; attempt < 2 && lanes; ++attempt) {
-            const Status found = classify_with(k, question.bound, tests, lanes);
+            const Status found = classify_with(k, y.bound, tests, lanes);
             free |= found.free & lanes;
             hit |= found.hit & ~found.free & lanes;
             left &= ~(free | hit);
@@ -301,28 +249,27 @@ for (const Questions& from : questions)
                 break;
             hit |= touching(k, tests) & lanes;
             k = without_zeros(k);
-            const Status constant = constant_status(k, Doubles(0.0), tests);
-            free |= (known(cubic_sign(k, Doubles(0.0))) | constant.free) & lanes & ~hit;
-            hit |= constant.hit & lanes & ~free;
+            free |= known(cubic_sign(k, Doubles(0.0))) & lanes & ~hit;
             left &= ~(free | hit);
             lanes = left & lanes;
         }
         if (left && !(roundoff > 0.0)) {
-            int slots[8];
-            for (int lane = 0; lane < 8; ++lane)
-                slots[lane] = first + from.numbers[begin + (lane < filled ? lane : 0)];
-            Scalars points[24];
-            read_points(slots, points);
-            const Motion motion = scaled_motion(points, left);
             const Vectors u = plus(motion.u0, motion.u1), v = plus(motion.v0, motion.v1);
             const Vectors w = plus(motion.w0, motion.w1);
-            hit |= left & ~direction_separates(motion, between(closest_coordinates(u, v, w), u, v, w));
-            left = 0;
-        }
-        for (int lane = 0; lane < filled; ++lane) {
-            const wp::uint64 bit = 1ull << from.numbers[begin + lane];
-            hits |= (hit >> lane) & 1 ? bit : 0;
-            unsures &= (left >> lane) & 1 ? ~0ull : ~bit;
+            const int apart = direction_separates(motion, between(closest_coordinates(u, v, w), u, v, w));
+            free |= left & apart;
+            hit |= left & ~apart;
         }
     }
-return wp::vec_t<2, wp::uint64>(hits, unsures);
+    free &= usable;
+    hit &= usable;
+    const int unsure = usable & ~(free | hit), open = all & ~usable;
+    auto spread = [](unsigned x) {
+        x = (x | (x << 4)) & 0x0f0fu;
+        x = (x | (x << 2)) & 0x3333u;
+        return (x | (x << 1)) & 0x5555u;
+    };
+    const unsigned long long packet = spread(hit | open) | (spread(unsure | open) << 1);
+    statuses |= packet << (2 * begin);
+}
+return statuses;

@@ -5,10 +5,9 @@ int near[batch];
 int near_count = 0;
 for (int i = 0; i < count; ++i) {
     near[near_count] = i;
-    if (boxes_meet) {
-        ++near_count;
+    near_count += boxes_meet;
+    if (boxes_meet)
         continue;
-    }
     const Four corner = corners_of(first + i);
     const bool has_fourth = __builtin_reduce_max(corner) < last;
     auto ends = [&](int i) { return both(position(x0, corner[i]), position(x1, corner[i]), has_fourth); };
@@ -30,11 +29,7 @@ for (int i = 0; i < count; ++i) {
 unsigned long long left = 0;
 for (int begin = 0; begin < near_count; begin += 8) {
     const int filled = near_count - begin < 8 ? near_count - begin : 8;
-    int slots[8];
-    for (int lane = 0; lane < 8; ++lane)
-        slots[lane] = first + near[begin + (lane < filled ? lane : 0)];
-    Scalars points[24];
-    read_points(slots, points);
+    const Points points = read_points([&](int lane) { return first + near[begin + lane]; }, filled);
 
     // Bernstein signs
     const Relative r = relative(points);
@@ -67,18 +62,8 @@ for (int begin = 0; begin < near_count; begin += 8) {
     const Vectors us = plus(u0, u1), vs = plus(v0, v1), ws = plus(w0, w1);
     const Vectors direction =
         vertex_face ? minus(ws, times(1.0 / 3.0, plus(us, vs))) : plus(ws, times(0.5, minus(vs, us)));
-    const Doubles du0 = dot(direction, u0), du1 = dot(direction, u1), zero = 0.0;
-    const Doubles dv0 = dot(direction, v0), dv1 = dot(direction, v1);
-    const Doubles dw0 = dot(direction, w0), dw1 = dot(direction, w1);
-    Doubles lowest, highest;
-    if (vertex_face) {
-        lowest = least(dw0 - most(most(du0, dv0), zero), dw1 - most(most(du1, dv1), zero));
-        highest = most(dw0 - least(least(du0, dv0), zero), dw1 - least(least(du1, dv1), zero));
-    } else {
-        lowest = least(dw0 - most(du0, zero) + least(dv0, zero), dw1 - most(du1, zero) + least(dv1, zero));
-        highest = most(dw0 - least(du0, zero) + most(dv0, zero), dw1 - least(du1, zero) + most(dv1, zero));
-    }
-    if (bits((lowest > 0.0) | (highest < 0.0)) & unsure) {
+    const Gap gap = gap_along(r, direction);
+    if (bits((gap.low > 0.0) | (gap.high < 0.0)) & unsure) {
         Doubles slack = 0.0;
         int trusted = 255;
         if (roundoff > 0.0) {
@@ -88,7 +73,7 @@ for (int begin = 0; begin < near_count; begin += 8) {
                 roundoff * (direction_error * dot(along, size) + underflow) + flushed * (along.x + along.y + along.z);
             trusted = bits(most(most(size.x, size.y), size.z) < largest_size);
         }
-        unsure &= ~(bits((lowest > slack) | (highest < -slack)) & trusted);
+        unsure &= ~(bits((gap.low > slack) | (gap.high < -slack)) & trusted);
     }
     for (int lane = 0; lane < filled; ++lane)
         left |= (unsigned long long)((unsure >> lane) & 1) << near[begin + lane];

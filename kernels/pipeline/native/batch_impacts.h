@@ -134,29 +134,21 @@ double queries[rows][batch + 8];
 int numbers[batch + 8], query_count = 0;
 for (int begin = 0; begin < selected_count; begin += 8) {
     const int filled = selected_count - begin < 8 ? selected_count - begin : 8;
-    int slots[8];
-    for (int lane = 0; lane < 8; ++lane)
-        slots[lane] = first + selected[begin + (lane < filled ? lane : 0)];
-    Scalars points[24];
-    read_points(slots, points);
     int usable = (1 << filled) - 1;
-    const Motion motion = scaled_motion(points, usable);
+    const Motion motion =
+        scaled_motion(read_points([&](int lane) { return first + selected[begin + lane]; }, filled), usable);
     const Query query = {motion, coplanarity(motion)};
     for (int i = 0; i < rows; ++i)
         append(queries[i] + query_count, ((const Doubles*)&query)[i], usable);
-    Ints these;
-    __builtin_memcpy(&these, selected + begin, sizeof(these));
-    query_count += append(numbers + query_count, these, usable);
+    query_count += append(numbers + query_count, *(const Ints*)(selected + begin), usable);
     for (int lane = 0; lane < filled; ++lane)
         open |= (unsigned long long)(~usable >> lane & 1) << selected[begin + lane];
 }
 // puts the values at the beginning of a list into some lanes, in order
 auto insert = [](Doubles into, const double* list, unsigned lanes) {
 #ifdef __AVX512VL__
-    typedef double Loaded __attribute__((vector_size(64), aligned(8)));
-    typedef double Whole __attribute__((vector_size(64)));
-    const Whole given = *(const Loaded*)list, old = __builtin_bit_cast(Whole, into);
-    return __builtin_bit_cast(Doubles, __builtin_ia32_expanddf512_mask(given, old, lanes));
+    typedef double Eight __attribute__((vector_size(64), aligned(8)));
+    return (Doubles)__builtin_ia32_expanddf512_mask(*(const Eight*)list, (Eight)into, lanes);
 #else
     for (; lanes; lanes &= lanes - 1)
         into[__builtin_ctz(lanes)] = *list++;

@@ -51,9 +51,8 @@ for (int lane = 1; lane < 8; ++lane)
     last_world = element[32 + lane] > last_world ? element[32 + lane] : last_world;
 
 constexpr int buffered = 512;
-long long found[buffered];
+wp::int64 found[buffered], filtered = 0;
 int count = 0;
-wp::int64 filtered = 0;
 auto flush = [&]() {
     const wp::int64 slot = __atomic_fetch_add(&counts.data[queued_count], (wp::int64)count, __ATOMIC_RELAXED);
     const wp::int64 room = pairs.shape[0] - slot;

@@ -2,7 +2,7 @@
 
 typedef double Doubles __attribute__((ext_vector_type(8)));
 typedef decltype(Doubles() < Doubles()) Longs;
-typedef int Ints __attribute__((ext_vector_type(8)));
+typedef int Ints __attribute__((ext_vector_type(8), aligned(4)));
 typedef bool Bools __attribute__((ext_vector_type(8)));
 struct Vectors {
     Doubles x, y, z;
@@ -37,34 +37,56 @@ auto corners_of = [&](int slot) -> Four {
                                    2, 3);
 };
 
-// reads the points of the pairs in eight slots, transposed to the coordinates of all eight
-auto read_points = [&](const int* slots, Scalars* points) {
+// the points of up to eight pairs, whose slots a function has by lane, as the coordinates of all eight
+struct Points {
+    Scalars x[24];
+};
+auto read_points = [&](auto slot, int filled) -> Points {
+    Points points;
     Four corners[8], largest = 0;
     for (int lane = 0; lane < 8; ++lane) {
-        corners[lane] = corners_of(slots[lane]);
+        corners[lane] = corners_of(slot(lane < filled ? lane : 0));
         largest = __builtin_elementwise_max(largest, corners[lane]);
     }
     const bool has_fourth = __builtin_reduce_max(largest) < last;
     for (int i = 0; i < 4; ++i) {
         auto corner = [&](int lane) { return corners[lane][i]; };
-        read_coordinates(x0, corner, has_fourth, points + 3 * i);
-        read_coordinates(x1, corner, has_fourth, points + 12 + 3 * i);
+        read_coordinates(x0, corner, has_fourth, points.x + 3 * i);
+        read_coordinates(x1, corner, has_fourth, points.x + 12 + 3 * i);
     }
+    return points;
 };
 
 // the differences u, v, w of eight pairs at both ends
 struct Relative {
     Vectors u0, v0, w0, u1, v1, w1;
 };
-auto relative = [&](const Scalars* points) -> Relative {
+auto relative = [&](const Points& points) -> Relative {
     auto point = [&](int i) {
-        return Vectors{__builtin_convertvector(points[3 * i], Doubles),
-                       __builtin_convertvector(points[3 * i + 1], Doubles),
-                       __builtin_convertvector(points[3 * i + 2], Doubles)};
+        auto coordinate = [&](int axis) { return __builtin_convertvector(points.x[3 * i + axis], Doubles); };
+        return Vectors{coordinate(0), coordinate(1), coordinate(2)};
     };
     if (vertex_face)
         return {minus(point(2), point(1)), minus(point(3), point(1)), minus(point(0), point(1)),
                 minus(point(6), point(5)), minus(point(7), point(5)), minus(point(4), point(5))};
     return {minus(point(1), point(0)), minus(point(3), point(2)), minus(point(2), point(0)),
             minus(point(5), point(4)), minus(point(7), point(6)), minus(point(6), point(4))};
+};
+
+// by how much a direction separates the features at both ends, on either side
+struct Gap {
+    Doubles low, high;
+};
+auto gap_along = [=](const auto& m, Vectors direction) -> Gap {
+    const Doubles u0 = dot(direction, m.u0), v0 = dot(direction, m.v0), w0 = dot(direction, m.w0);
+    const Doubles u1 = dot(direction, m.u1), v1 = dot(direction, m.v1), w1 = dot(direction, m.w1), zero = 0.0;
+    Doubles low, high;
+    if (vertex_face) {
+        low = least(w0 - most(most(u0, v0), zero), w1 - most(most(u1, v1), zero));
+        high = most(w0 - least(least(u0, v0), zero), w1 - least(least(u1, v1), zero));
+    } else {
+        low = least(w0 - most(u0, zero) + least(v0, zero), w1 - most(u1, zero) + least(v1, zero));
+        high = most(w0 - least(u0, zero) + most(v0, zero), w1 - least(u1, zero) + most(v1, zero));
+    }
+    return {low, high};
 };

@@ -39,7 +39,7 @@ struct Motion {
     Vectors u0, v0, w0, u1, v1, w1, u_size, v_size, w_size;
     Doubles scale;
 };
-auto scaled_motion = [&](const Scalars* points, int& usable) -> Motion {
+auto scaled_motion = [&](const Points& points, int& usable) -> Motion {
     Relative r = relative(points);
     Vectors u = sizes(r.u0, r.u1), v = sizes(r.v0, r.v1), w = sizes(r.w0, r.w1);
     auto largest = [=](Vectors a) { return most(a.x, most(a.y, a.z)); };
@@ -50,7 +50,7 @@ auto scaled_motion = [&](const Scalars* points, int& usable) -> Motion {
         typedef unsigned Words __attribute__((ext_vector_type(8)));
         Words smallest = 0xffffffffu;
         for (int i = 0; i < 24; ++i) {  // zero becomes the largest number
-            const Words word = __builtin_bit_cast(Words, __builtin_convertvector(points[i], Floats)) & 0x7fffffffu;
+            const Words word = __builtin_bit_cast(Words, __builtin_convertvector(points.x[i], Floats)) & 0x7fffffffu;
             smallest = __builtin_elementwise_min(smallest, word - 1u);
         }
         usable &= bits(smallest >= 0x007fffffu);
@@ -191,23 +191,13 @@ auto between = [=](Coordinates c, Vectors u, Vectors v, Vectors w) {
     return minus(minus(times(c.first, u), times(c.second, v)), w);
 };
 
-// by how much a direction separates the features at both ends, on either side
 struct Gaps {
     Doubles low, high, bound;
 };
 auto gaps_along = [=](const Motion& m, Vectors direction) -> Gaps {
-    const Doubles u0 = dot(direction, m.u0), v0 = dot(direction, m.v0), w0 = dot(direction, m.w0);
-    const Doubles u1 = dot(direction, m.u1), v1 = dot(direction, m.v1), w1 = dot(direction, m.w1), zero = 0.0;
-    Doubles low, high;
-    if (vertex_face) {
-        low = least(w0 - most(most(u0, v0), zero), w1 - most(most(u1, v1), zero));
-        high = most(w0 - least(least(u0, v0), zero), w1 - least(least(u1, v1), zero));
-    } else {
-        low = least(w0 - most(u0, zero) + least(v0, zero), w1 - most(u1, zero) + least(v1, zero));
-        high = most(w0 - least(u0, zero) + most(v0, zero), w1 - least(u1, zero) + most(v1, zero));
-    }
+    const Gap gap = gap_along(m, direction);
     const Doubles size = dot(sizes(direction, direction), plus(plus(m.u_size, m.v_size), m.w_size));
-    return {low, high, roundoff * (direction_error * size + underflow)};
+    return {gap.low, gap.high, roundoff * (direction_error * size + underflow)};
 };
 // the lanes in which a direction certainly separates the features at both ends, on the same side
 auto direction_separates = [=](const Motion& m, Vectors direction) -> int {

@@ -11,12 +11,11 @@ from warp_bsc.bench.measure.methods import Queries, QuerySet
 from warp_bsc.detection.run.settings import NO_FUSED_OPERATIONS, PairKind
 from warp_bsc.kernels.classification import classify
 from warp_bsc.kernels.motion import relative_motion
-from warp_bsc.kernels.pipeline.batch_classification import BATCH, classify_batch_of
+from warp_bsc.kernels.pipeline.batch_classification import BATCH, OPEN, classify_batch_of
 from warp_bsc.kernels.polynomials import coplanarity
 from warp_bsc.kernels.signs import FREE, HIT, ROUNDOFF, UNSURE
 
 KINDS = ("vertex_face", "edge_edge")
-OPEN = 3
 
 
 def kernels_of(kind, dtype):

@@ -12,17 +12,20 @@ from ...kernels.motion import relative_motion
 from ...kernels.pairs import ends_of, vertices_of_pair
 from ...kernels.pipeline.batch_arc_culling import cull_arc_batch_of
 from ...kernels.pipeline.batch_classification import BATCH as CLASSIFIED
-from ...kernels.pipeline.batch_classification import classify_batch_of
+from ...kernels.pipeline.batch_classification import OPEN, classify_batch_of
 from ...kernels.pipeline.batch_culling import BATCH, cull_batch_of
 from ...kernels.pipeline.batch_impacts import BATCH as DECIDED
 from ...kernels.pipeline.batch_impacts import impact_batch_of
 from ...kernels.pipeline.queues import filled_entries, raise_count, take_slots, write
 from ...kernels.polynomials import coplanarity
-from ...kernels.signs import FREE, HIT, UNSURE
+from ...kernels.signs import FREE, UNSURE
 from ...kernels.time_of_impact import clamped_tolerance, impact, power_of_two
 from ..run.launch import made_once
 from ..run.settings import NO_FUSED_OPERATIONS, Count, PairKind
 from .pair_kernels import PairBuffers, write_decision, write_impact
+
+_LOWER_BITS = wp.constant(wp.uint64(0x5555555555555555))
+"""The lower of the two bits of each status of a batch."""
 
 
 @wp.func
@@ -114,28 +117,23 @@ def batch_classification_kernel(kind: PairKind, dtype: type) -> wp.Kernel:
     ):
         i = CLASSIFIED * (first + wp.tid())
         number = wp.min(CLASSIFIED, filled_entries(buffers.survivors, buffers.counts, Count.SURVIVORS) - i)
-        found = classify_batch(x0, x1, buffers.elements, buffers.survivors, i, number, roundoff)
-        hits, unsures = found[0], found[1]
-        left = hits & unsures
+        statuses = classify_batch(x0, x1, buffers.elements, buffers.survivors, i, number, roundoff)
+        left = statuses & (statuses >> wp.uint64(1)) & _LOWER_BITS
         while left != wp.uint64(0):
             bit = lowest_bit(left)
-            v = vertices_of_pair(kind_number, buffers.elements, buffers.survivors[i + bit])
+            v = vertices_of_pair(kind_number, buffers.elements, buffers.survivors[i + bit // 2])
             a0, b0, c0, d0, a1, b1, c1, d1 = ends_of(x0, x1, v)
             motion = relative_motion(kind_number, a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
             status = classify(motion, coplanarity(motion))
-            hits = hits ^ (wp.uint64(status != HIT) << wp.uint64(bit))
-            unsures = unsures ^ (wp.uint64(status != UNSURE) << wp.uint64(bit))
+            statuses = statuses ^ (wp.uint64(OPEN ^ status) << wp.uint64(bit))
             left = left & (left - wp.uint64(1))
-        contacts = hits | unsures
+        contacts = (statuses | (statuses >> wp.uint64(1))) & _LOWER_BITS
         slot = take_slots(buffers.counts, Count.CONTACTS, count_bits(contacts))
         while contacts != wp.uint64(0):
             bit = lowest_bit(contacts)
             if slot < wp.int64(buffers.contacts.pairs.shape[0]):
-                status = HIT
-                if ((unsures >> wp.uint64(bit)) & wp.uint64(1)) == wp.uint64(1):
-                    status = UNSURE
-                buffers.contacts.pairs[wp.int32(slot)] = buffers.survivors[i + bit]
-                buffers.contacts.status[wp.int32(slot)] = wp.int8(status)
+                buffers.contacts.pairs[wp.int32(slot)] = buffers.survivors[i + bit // 2]
+                buffers.contacts.status[wp.int32(slot)] = wp.int8((statuses >> wp.uint64(bit)) & wp.uint64(3))
             slot += wp.int64(1)
             contacts = contacts & (contacts - wp.uint64(1))
 
