@@ -4,10 +4,10 @@ typedef double Doubles __attribute__((ext_vector_type(8)));
 typedef float Row __attribute__((ext_vector_type(8), aligned(4)));
 typedef int Ints __attribute__((ext_vector_type(8), aligned(4)));
 
-int* element = elements.data + 48 * (size_t)packet;
-float* box = boxes.data + 96 * (size_t)packet;
-float* node = nodes.data + 96 * (size_t)(packet / 8) + packet % 8;
-int* marks = node_marks.data + 24 * (size_t)(packet / 8) + packet % 8;
+int* element = tree.elements.data + 48 * (size_t)packet;
+float* box = tree.boxes.data + 96 * (size_t)packet;
+float* node = tree.nodes.data + 96 * (size_t)(packet / 8) + packet % 8;
+int* marks = tree.node_marks.data + 24 * (size_t)(packet / 8) + packet % 8;
 
 auto lesser = [](auto a, auto b) { return b < a ? b : a; };
 auto greater = [](auto a, auto b) { return b > a ? b : a; };
@@ -18,7 +18,7 @@ const Scalars infinity = __builtin_inf();
 auto finite = infinity == infinity;
 Doubles pad = 0.0;
 Ints lane_marks = changed.data ? 0 : 1;
-for (int i = 0; i < corners; ++i) {
+for (int i = 0; i < tree.corners; ++i) {
     int corners_of_lanes[8], largest = 0;
     for (int lane = 0; lane < 8; ++lane) {
         const int corner = corners_of_lanes[lane] = element[8 + 8 * i + (lane < count ? lane : 0)];

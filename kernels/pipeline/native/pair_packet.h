@@ -11,8 +11,8 @@ auto bits = [](Ints mask) -> unsigned {
     return __builtin_bit_cast(unsigned char, __builtin_convertvector(mask, Bools));
 };
 
-const float* box = boxes.data + 96 * (size_t)packet;
-const int* element = elements.data + 48 * (size_t)packet;
+const float* box = tree.boxes.data + 96 * (size_t)packet;
+const int* element = tree.elements.data + 48 * (size_t)packet;
 
 // the packet's boxes, with keep_separated those over all of the time for each end, and the box around them
 float own[96], whole[96];
@@ -63,10 +63,11 @@ auto flush = [&]() {
 
 // whether each corner of one element meets each corner of the other
 auto meet = [&](const int* at, const int* other_at) -> bool {
-    for (int i = 0; i < corners; ++i)
-        for (int j = 0; j < other_corners; ++j) {
+    for (int i = 0; i < tree.corners; ++i)
+        for (int j = 0; j < traversed.corners; ++j) {
             const int a = at[8 * i], b = other_at[8 * j];
-            if (!(group.data[a] & group_mask.data[b]) || !(group.data[b] & group_mask.data[a]))
+            if (!(pair_filter.group.data[a] & pair_filter.mask.data[b]) ||
+                !(pair_filter.group.data[b] & pair_filter.mask.data[a]))
                 return false;
         }
     return true;
@@ -84,24 +85,24 @@ int near[most_near + 8], near_count = 0;
 auto compare = [&]() {
     int others[8 * most_near + 8], other_count = 0;
     for (int i = 0; i < near_count; ++i) {
-        unsigned meets = bits(meeting(other_boxes.data + 96 * (size_t)near[i], whole));
+        unsigned meets = bits(meeting(traversed.boxes.data + 96 * (size_t)near[i], whole));
         if (!changed)
-            meets &= bits(ints(other_elements.data + 48 * (size_t)near[i] + 40) != 0);
+            meets &= bits(ints(traversed.elements.data + 48 * (size_t)near[i] + 40) != 0);
         other_count += append(others + other_count, 8 * near[i] + lanes, meets);
     }
     near_count = 0;
     for (int i = 0; i < other_count; ++i) {
         const int other = others[i] / 8, lane = others[i] % 8;
-        const int* other_element = other_elements.data + 48 * (size_t)other + lane;
-        Ints met = meeting(own, other_boxes.data + 96 * (size_t)other + lane);
+        const int* other_element = traversed.elements.data + 48 * (size_t)other + lane;
+        Ints met = meeting(own, traversed.boxes.data + 96 * (size_t)other + lane);
         met &= (ints(element + 32) == other_element[32]) & (excluded != other_element[40]);
-        for (int i = 0; i < corners; ++i)
-            for (int j = 0; j < other_corners; ++j)
+        for (int i = 0; i < tree.corners; ++i)
+            for (int j = 0; j < traversed.corners; ++j)
                 met &= ints(element + 8 + 8 * i) != other_element[8 + 8 * j];
         unsigned mask = bits(met);
         if (symmetric && other == packet)
             mask &= (1u << lane) - 1u;
-        if (group.data) {
+        if (pair_filter.group.data) {
             unsigned left_out = 0;
             for (unsigned rest = mask; rest; rest &= rest - 1)
                 if (!meet(element + 8 + __builtin_ctz(rest), other_element + 8))
@@ -124,11 +125,11 @@ auto compare = [&]() {
 
 // nodes with their levels; at most seven wait on each of at most eleven levels, and eight are added at once
 int stack[96], height = 0;
-stack[height++] = level_starts.shape[0] - 2;
+stack[height++] = traversed.level_starts.shape[0] - 2;
 while (height > 0) {
     const int level = stack[--height] % 16, node = stack[height] / 16;
-    const float* child = other_nodes.data + 96 * (size_t)(level_starts.data[level] + node);
-    const int* child_marks = other_node_marks.data + 24 * (size_t)(level_starts.data[level] + node);
+    const float* child = traversed.nodes.data + 96 * (size_t)(traversed.level_starts.data[level] + node);
+    const int* child_marks = traversed.node_marks.data + 24 * (size_t)(traversed.level_starts.data[level] + node);
     const Ints children = 8 * node + lanes;
     Ints overlap = (ints(child_marks) <= last_world) & (ints(child_marks + 8) >= first_world);
     if (!changed)

@@ -75,10 +75,8 @@ class BroadPhaseSimd:
             trees.append(self._edges_of_faces)
         self._build(trees, x0, x1, changed)
         options = {"keep_separated": keep_separated, "filtered_of_worlds": self._filtered_of_worlds}
-        pairings = [
-            self._vertices.pairing(self._faces, *out[:2], **options),
-            self._edges.pairing(self._edges, *out[2:4], ordered=True, **options),
-        ]
+        pairings = [self._vertices.pairing(self._faces, *out[:2], **options)]
+        pairings.append(self._edges.pairing(self._edges, *out[2:4], ordered=True, **options))
         if self._edges_of_faces:
             pairings.append(self._edges.pairing(self._edges_of_faces, *out[2:4], ordered=True, **options))
         if self._points and self._free_edges and out[4:]:

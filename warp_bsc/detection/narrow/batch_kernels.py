@@ -16,7 +16,7 @@ from ...kernels.pipeline.batch_classification import OPEN, classify_batch_of
 from ...kernels.pipeline.batch_culling import BATCH, cull_batch_of
 from ...kernels.pipeline.batch_impacts import BATCH as DECIDED
 from ...kernels.pipeline.batch_impacts import impact_batch_of
-from ...kernels.pipeline.queues import filled_entries, raise_count, take_slots, write
+from ...kernels.pipeline.queues import filled_entries, raise_count, take_slot, take_slots, write
 from ...kernels.polynomials import coplanarity
 from ...kernels.signs import FREE, UNSURE
 from ...kernels.time_of_impact import clamped_tolerance, impact, power_of_two
@@ -142,11 +142,10 @@ def batch_classification_kernel(kind: PairKind, dtype: type) -> wp.Kernel:
 
 @wp.func
 def _decide_batch(first: int, count: int, timed: bool, buffers: PairBuffers):
-    """Decides contacts as the kernel of a GPU does, with one atomic operation for each count."""
+    """Decides contacts as the kernel of a GPU does, with one atomic operation for the counts of all."""
     contacts = buffers.contacts
     found = int(0)
     unsure = int(0)
-    for_exact = int(0)
     for i in range(first, first + count):
         status = contacts.status[i]
         write_decision(i, int(status), buffers)
@@ -155,16 +154,9 @@ def _decide_batch(first: int, count: int, timed: bool, buffers: PairBuffers):
             if status == wp.int8(UNSURE):
                 unsure += 1
             if status == wp.int8(UNSURE) or (timed and not contacts.within_tolerance[i]):
-                for_exact += 1
+                buffers.for_exact[wp.int32(take_slot(buffers.counts, Count.FOR_EXACT))] = i
     raise_count(buffers.counts, Count.FOUND, found)
     raise_count(buffers.counts, Count.UNSURE, unsure)
-    if for_exact > 0:
-        slot = wp.int32(take_slots(buffers.counts, Count.FOR_EXACT, for_exact))
-        for i in range(first, first + count):
-            status = contacts.status[i]
-            if status == wp.int8(UNSURE) or (status != wp.int8(FREE) and timed and not contacts.within_tolerance[i]):
-                buffers.for_exact[slot] = i
-                slot += 1
 
 
 @made_once
