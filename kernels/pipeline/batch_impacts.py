@@ -52,7 +52,8 @@ def impact_batch_of(dtype: type, vertex_face: bool) -> wp.Function:
         only decides what is UNSURE. It returns two sets of pairs, as bits: those that remain open, and those that are
         touching. Indices are not checked.
     """
-    snippet = native_for_pairs(dtype, vertex_face, "simd_query.h", "simd_roots.h", "batch_impacts.h", **_CONSTANTS)
+    headers = ("simd_query.h", "simd_roots.h", "append.h", "batch_impacts.h")
+    snippet = native_for_pairs(dtype, vertex_face, *headers, **_CONSTANTS)
 
     @wp.func_native(snippet)
     def impact_batch(

@@ -15,9 +15,9 @@ def native_for_pairs(dtype: type, vertex_face: bool, *headers: str, **constants:
     Args:
         dtype: Type of a position, vec3 or vec3d.
         vertex_face: Whether pairs are (vertex, face); otherwise (edge, edge).
-        headers: Headers of this folder's ``native`` that make the function, after ``simd.h``.
+        headers: Headers of this folder's ``native`` that make the function, after ``positions.h`` and ``simd.h``.
         constants: Numbers that they use, by name.
     """
     scalar = {"Scalar": "float" if dtype is wp.vec3 else "double"}
-    texts = [header(__file__, name) for name in ("simd.h", *headers)]
+    texts = [header(__file__, name) for name in ("positions.h", "simd.h", *headers)]
     return definitions(scalar, vertex_face=vertex_face, **constants) + "".join(texts)

@@ -19,25 +19,27 @@ import functools
 import warp as wp
 
 from ..native_text import definitions, header
+from ..pairs import PairFilter
 
 
-@wp.func_native(snippet=header(__file__, "pair_packet.h"))
+@wp.struct
+class WideBvh:
+    """A tree, whose packets have eight elements each, and whose nodes have eight packets or nodes each."""
+
+    boxes: wp.array[wp.float32]
+    elements: wp.array[int]
+    corners: int  # of an element
+    nodes: wp.array[wp.float32]
+    node_marks: wp.array[int]
+    level_starts: wp.array[int]
+
+
+@wp.func_native(snippet=header(__file__, "append.h") + header(__file__, "pair_packet.h"))
 def pair_packet(
     packet: int,
-    # tree of the packet
-    boxes: wp.array[wp.float32],
-    elements: wp.array[wp.int32],
-    corners: int,
-    # tree that is traversed
-    other_boxes: wp.array[wp.float32],
-    other_elements: wp.array[wp.int32],
-    other_corners: int,
-    other_nodes: wp.array[wp.float32],
-    other_node_marks: wp.array[wp.int32],
-    level_starts: wp.array[wp.int32],
-    # filter
-    group: wp.array[wp.int32],
-    group_mask: wp.array[wp.int32],
+    tree: WideBvh,
+    traversed: WideBvh,
+    pair_filter: PairFilter,
     # options
     symmetric: int,
     ordered: int,
@@ -73,29 +75,24 @@ def fit_packet_of(dtype: type) -> wp.Function:
 
     Returns:
         Device function for the CPU. Its arguments are the packet, the number of its elements, the positions at both
-        ends, the number of corners of an element, the mark of each vertex or None for 1, how far boxes reach
-        beyond each vertex or None, and the elements. It writes the boxes, the packet's entry in its node, and the
-        marks of the elements. Boxes are rounded as by :func:`~warp_bsc.kernels.boxes.rounded`. That of an
-        element with a position that is not finite is empty. Indices are not checked.
+        ends, the mark of each vertex or None for 1, how far boxes reach beyond each vertex or None, and the tree. It
+        writes the boxes, the packet's entry in its node, and the marks of the elements. Boxes are rounded as by
+        :func:`~warp_bsc.kernels.boxes.rounded`. That of an element with a position that is not finite is empty.
+        Indices are not checked.
     """
     scalar = definitions({"Scalar": "float" if dtype is wp.vec3 else "double"})
 
-    @wp.func_native(scalar + header(__file__, "fit_packet.h"))
+    @wp.func_native(scalar + header(__file__, "positions.h") + header(__file__, "fit_packet.h"))
     def fit_packet(
         packet: int,
         count: int,
         # in
         x0: wp.array[dtype],
         x1: wp.array[dtype],
-        corners: int,
         changed: wp.array[int],
         padding: wp.array[wp.float64],
         # in and out
-        elements: wp.array[int],
-        # out
-        boxes: wp.array[wp.float32],
-        nodes: wp.array[wp.float32],
-        node_marks: wp.array[int],
+        tree: WideBvh,
     ): ...
 
     return fit_packet

@@ -39,7 +39,10 @@ def native_functions():
 def compile_functions(functions, path):
     """Compiles native functions as Warp does, but that each header is named in errors; raises an error if it fails."""
     codegen = wp._src.codegen
-    source = codegen.cpu_module_header.format(block_dim=1) + WARNINGS
+    source = codegen.cpu_module_header.format(block_dim=1)
+    arguments = [argument.type for function in functions for argument in function.adj.args]
+    structs = dict.fromkeys(each for each in arguments if hasattr(each, "native_name"))
+    source += "".join(map(codegen.codegen_struct, structs)) + WARNINGS
     for number, function in enumerate(functions):
         snippet = function.native_snippet
         for name, text in HEADERS.items():

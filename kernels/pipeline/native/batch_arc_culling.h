@@ -24,17 +24,14 @@ auto read_packet = [&](const int* which, int filled) -> Packet {
     auto slot = [&](int lane) { return first + which[lane < filled ? lane : 0]; };
     Doubles distance;
     for (int lane = 0; lane < 8; ++lane) {
-        int corner[4];
-        corners_of(slot(lane), corner);
+        const Four corner = corners_of(slot(lane));
         const double* of = (const double*)deviation.data;
         const double a = of[corner[0]], b = of[corner[1]], other = larger_of(of[corner[2]], of[corner[3]]);
         distance[lane] = vertex_face ? a + larger_of(b, other) : larger_of(a, b) + other;
     }
-    Scalars points[24];
-    read_points(slot, points);
     const int all = (1 << filled) - 1;
     int usable = all;
-    const Motion motion = scaled_motion(points, usable);
+    const Motion motion = scaled_motion(read_points(slot, filled), usable);
     return {motion, most(above_sum * (distance * motion.scale), Doubles(smallest)), all, usable};
 };
 

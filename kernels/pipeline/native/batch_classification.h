@@ -135,11 +135,9 @@ auto without_zeros = [&](Cubic k) -> Cubic {
 unsigned long long statuses = 0;
 for (int begin = 0; begin < count; begin += 8) {
     const int filled = count - begin < 8 ? count - begin : 8;
-    Scalars points[24];
-    read_points([&](int lane) { return first + begin + (lane < filled ? lane : 0); }, points);
     const int all = (1 << filled) - 1;
     int usable = all;
-    const Motion motion = scaled_motion(points, usable);
+    const Motion motion = scaled_motion(read_points([&](int lane) { return first + begin + lane; }, filled), usable);
     const Coplanarity y = coplanarity(motion);
     int free = one_sign(y.k, y.bound), hit = 0, left = usable & ~free;
     if (left) {

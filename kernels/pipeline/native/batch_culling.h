@@ -4,14 +4,11 @@
 int near[batch], near_count = 0;
 for (int i = 0; i < count; ++i) {
     near[near_count] = i;
-    if (boxes_meet) {
-        ++near_count;
+    near_count += boxes_meet;
+    if (boxes_meet)
         continue;
-    }
-    int corner[4];
-    corners_of(first + i, corner);
-    auto later = [](int a, int b) { return a > b ? a : b; };
-    const bool has_fourth = later(later(corner[0], corner[1]), later(corner[2], corner[3])) < last;
+    const Four corner = corners_of(first + i);
+    const bool has_fourth = __builtin_reduce_max(corner) < last;
     auto ends = [&](int i) { return both(position(x0, corner[i]), position(x1, corner[i]), has_fourth); };
     const Scalars a = ends(0), b = ends(1), c = ends(2), d = ends(3);
     Scalars low = a, high = a;
@@ -31,8 +28,7 @@ for (int i = 0; i < count; ++i) {
 unsigned long long left = 0;
 for (int begin = 0; begin < near_count; begin += 8) {
     const int filled = near_count - begin < 8 ? near_count - begin : 8;
-    Scalars points[24];
-    read_points([&](int lane) { return first + near[begin + (lane < filled ? lane : 0)]; }, points);
+    const Points points = read_points([&](int lane) { return first + near[begin + lane]; }, filled);
 
     // bounds take longer than signs: only where some lane has one sign; with a roundoff of zero they are zero
     const Relative r = relative(points);

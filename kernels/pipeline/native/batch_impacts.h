@@ -1,4 +1,4 @@
-// The body of impact_batch; after simd_query.h.
+// The body of impact_batch; after simd_query.h and append.h.
 
 auto mix = [](Doubles a, Doubles b, Doubles t) { return (1.0 - t) * a + t * b; };
 auto mix_vector = [=](Vectors a, Vectors b, Doubles t) { return plus(times(1.0 - t, a), times(t, b)); };
@@ -110,10 +110,10 @@ auto approximate_meeting_time = [&](const Motion& m, Doubles start, Doubles end)
 };
 
 // the lanes whose features touch, but nowhere with strict signs, see batch_impacts.py
-auto touching = [&](const Scalars* points, const Query& query, int lanes) -> int {
+auto touching = [&](const Points& points, const Query& query, int lanes) -> int {
     typedef decltype(Scalars() == Scalars()) Words;
     auto alike = [&](int axis, int a, int b) -> Words {
-        auto word = [&](int point) { return __builtin_bit_cast(Words, points[3 * point + axis]); };
+        auto word = [&](int point) { return __builtin_bit_cast(Words, points.x[3 * point + axis]); };
         return (word(a) == word(b)) & (word(a + 4) == word(b + 4));
     };
     constexpr int tests_of_borders = vertex_face ? 3 : 4, omitted[2][4] = {{1, 0, 3, 2}, {2, 3, 1}};
@@ -154,29 +154,41 @@ auto touching = [&](const Scalars* points, const Query& query, int lanes) -> int
 };
 
 unsigned long long open = 0, touched = 0;
-Query packets[batch / 8];
-int entries[batch], entry_count = 0;
+int selected[batch + 8], selected_count = 0;
 for (int i = 0; i < count; ++i) {
-    entries[entry_count] = i;
-    entry_count += timed || status.data[first + i] != HIT;
+    selected[selected_count] = i;
+    selected_count += timed || status.data[first + i] != HIT;
 }
-int queue[batch], queued = 0;  // the entries whose search has not begun
-for (int begin = 0; begin < entry_count; begin += 8) {
-    const int filled = entry_count - begin < 8 ? entry_count - begin : 8;
-    Scalars points[24];
-    read_points([&](int lane) { return first + entries[begin + (lane < filled ? lane : 0)]; }, points);
+// the queries that are to be searched, and the numbers of their pairs
+constexpr int rows = sizeof(Query) / sizeof(Doubles), rows_of_motion = sizeof(Motion) / sizeof(Doubles);
+double queries[rows][batch + 8];
+int numbers[batch + 8], query_count = 0;
+for (int begin = 0; begin < selected_count; begin += 8) {
+    const int filled = selected_count - begin < 8 ? selected_count - begin : 8;
     int usable = (1 << filled) - 1;
-    Query& query = packets[begin / 8];
-    query.motion = scaled_motion(points, usable);
-    query.y = coplanarity(query.motion);
+    const Points points = read_points([&](int lane) { return first + selected[begin + lane]; }, filled);
+    const Motion motion = scaled_motion(points, usable);
+    const Query query = {motion, coplanarity(motion)};
     const int touches = timed ? 0 : touching(points, query, usable);
+    for (int i = 0; i < rows; ++i)
+        append(queries[i] + query_count, ((const Doubles*)&query)[i], usable & ~touches);
+    query_count += append(numbers + query_count, *(const Ints*)(selected + begin), usable & ~touches);
     for (int lane = 0; lane < filled; ++lane) {
-        if ((usable & ~touches) >> lane & 1)
-            queue[queued++] = begin + lane;
-        else
-            ((touches >> lane & 1) ? touched : open) |= 1ull << entries[begin + lane];
+        open |= (unsigned long long)(~usable >> lane & 1) << selected[begin + lane];
+        touched |= (unsigned long long)(touches >> lane & 1) << selected[begin + lane];
     }
 }
+// puts the values at the beginning of a list into some lanes, in order
+auto insert = [](Doubles into, const double* list, unsigned lanes) {
+#ifdef __AVX512VL__
+    typedef double Eight __attribute__((vector_size(64), aligned(8)));
+    return (Doubles)__builtin_ia32_expanddf512_mask(*(const Eight*)list, (Eight)into, lanes);
+#else
+    for (; lanes; lanes &= lanes - 1)
+        into[__builtin_ctz(lanes)] = *list++;
+    return into;
+#endif
+};
 
 // the search of each lane for its first contact, see first_contact
 const double shortest = finest * length;
@@ -185,22 +197,24 @@ double time_found[batch], time_of_contact[batch];
 signed char outcome[batch];
 Doubles start = 0.0, end = 1.0, root = 0.0;
 int ahead = 0, passing = 0, halved = 0, probing = 0, probed = 0, begun = 0, certain = 0, running = 0;
-int entry[8], visits[8], next = 0;
+int entry[8], visits[8], next = 0;  // the next query whose search has not begun
 for (;;) {
-    for (int lane = 0; lane < 8 && next < queued; ++lane) {
-        if ((running >> lane) & 1)
-            continue;
-        const int e = queue[next++], bit = 1 << lane;
-        const double* from = (const double*)&packets[e / 8] + e % 8;
-        double* to = (double*)&query + lane;
-        for (int i = 0; i < (int)(sizeof(Query) / sizeof(Doubles)); ++i)
-            to[8 * i] = from[8 * i];
-        entry[lane] = e, visits[lane] = 0;
-        start[lane] = 0.0, end[lane] = 1.0, root[lane] = 0.0;
-        ahead &= ~bit, passing &= ~bit, halved &= ~bit, probing &= ~bit, begun &= ~bit, running |= bit;
-        certain = status.data[first + entries[e]] == HIT ? certain | bit : certain & ~bit;
-        const double k0 = query.y.k.k0[lane], bound = query.y.bound[lane];
-        probed = k0 > bound || k0 < -bound ? probed | bit : probed & ~bit;
+    int fresh = ~running & 255;
+    while (__builtin_popcount(fresh) > query_count - next)
+        fresh &= fresh - 1;
+    if (fresh) {
+        for (int i = 0; i < rows; ++i)
+            ((Doubles*)&query)[i] = insert(((const Doubles*)&query)[i], queries[i] + next, fresh);
+        for (int left = fresh; left; left &= left - 1) {
+            const int lane = __builtin_ctz(left), bit = 1 << lane;
+            certain = status.data[first + numbers[next]] == HIT ? certain | bit : certain & ~bit;
+            entry[lane] = next++, visits[lane] = 0;
+        }
+        const Doubles zero = 0.0, one = 1.0, k0 = query.y.k.k0, bound = query.y.bound;
+        const Longs begins = lanes_of(fresh);
+        start = where(begins, zero, start), end = where(begins, one, end), root = where(begins, zero, root);
+        ahead &= ~fresh, passing &= ~fresh, halved &= ~fresh, probing &= ~fresh, begun &= ~fresh, running |= fresh;
+        probed = (probed & ~fresh) | (bits((k0 > bound) | (k0 < -bound)) & fresh);
     }
     if (!running)
         break;
@@ -308,20 +322,21 @@ auto contact_at = [&](const Motion& m, Doubles t, Coordinates& at) -> Vectors {
     return Vectors{normal.x / size, normal.y / size, normal.z / size};
 };
 typedef wp::vec_t<3, double> Point;
-for (int begin = 0; begin < entry_count; begin += 8) {
-    const int filled = entry_count - begin < 8 ? entry_count - begin : 8;
+for (int begin = 0; begin < query_count; begin += 8) {
+    const int filled = query_count - begin < 8 ? query_count - begin : 8;
     Vectors normals;
     Coordinates at;
     if (timed) {
+        Motion motion;
+        for (int i = 0; i < rows_of_motion; ++i)
+            __builtin_memcpy((Doubles*)&motion + i, queries[i] + begin, sizeof(Doubles));
         Doubles t = 0.0;
         for (int lane = 0; lane < filled; ++lane)
-            t[lane] = (open >> entries[begin + lane]) & 1 ? 0.0 : time_of_contact[begin + lane];
-        normals = contact_at(packets[begin / 8].motion, t, at);
+            t[lane] = time_of_contact[begin + lane];
+        normals = contact_at(motion, t, at);
     }
     for (int lane = 0; lane < filled; ++lane) {
-        const int i = first + entries[begin + lane], e = begin + lane;
-        if (((open | touched) >> entries[e]) & 1)
-            continue;
+        const int i = first + numbers[begin + lane], e = begin + lane;
         if (outcome[e] != UNSURE)
             status.data[i] = outcome[e];
         if (!timed)

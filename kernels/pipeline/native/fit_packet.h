@@ -1,73 +1,63 @@
-// The body of fit_packet; Scalar is the type of a coordinate.
+// The body of fit_packet; after positions.h.
 
-typedef Scalar Four __attribute__((ext_vector_type(4)));
-typedef Scalar Loaded __attribute__((ext_vector_type(4), aligned(sizeof(Scalar))));
-typedef double Doubles __attribute__((ext_vector_type(4)));
-typedef float Row __attribute__((ext_vector_type(4)));
+typedef double Doubles __attribute__((ext_vector_type(8)));
+typedef float Row __attribute__((ext_vector_type(8), aligned(4)));
+typedef int Ints __attribute__((ext_vector_type(8), aligned(4)));
 
-const Scalar infinity = __builtin_inf();
-const int* element = elements.data + 48 * (size_t)packet;
-float* box = boxes.data + 96 * (size_t)packet;
-float* node = nodes.data + 96 * (size_t)(packet / 8) + packet % 8;
-int* marks = node_marks.data + 24 * (size_t)(packet / 8) + packet % 8;
+int* element = tree.elements.data + 48 * (size_t)packet;
+float* box = tree.boxes.data + 96 * (size_t)packet;
+float* node = tree.nodes.data + 96 * (size_t)(packet / 8) + packet % 8;
+int* marks = tree.node_marks.data + 24 * (size_t)(packet / 8) + packet % 8;
 
-// positions may be a view, with any stride; a fourth number is read with them where there is one
-auto load = [&](const auto& x, int corner) -> Four {
-    const Scalar* from = (const Scalar*)((const char*)x.data + x.strides[0] * (wp::int64)corner);
-    if (corner + 1 < x.shape[0] && x.strides[0] >= 3 * (int)sizeof(Scalar))
-        return *(const Loaded*)from;
-    return Four{from[0], from[1], from[2], 0};
-};
-// to single precision, to nearest: rounding and clamping keep order
-auto rounded = [](Four x, double pad) {
-    const Doubles largest = 3.4028234663852886e38;
-    const Doubles moved = __builtin_convertvector(x, Doubles) + pad;
-    const Doubles clamped = __builtin_elementwise_max(__builtin_elementwise_min(moved, largest), -largest);
-    return __builtin_convertvector(clamped, Row);
-};
+auto lesser = [](auto a, auto b) { return b < a ? b : a; };
+auto greater = [](auto a, auto b) { return b > a ? b : a; };
 
-float rows[12][8];
-Row whole[4];
-for (int row = 0; row < 4; ++row) {
-    whole[row] = row % 2 ? -__builtin_inff() : __builtin_inff();
-    for (int axis = 0; axis < 3; ++axis)
-        for (int lane = 0; lane < 8; ++lane)
-            rows[4 * axis + row][lane] = whole[row][0];
-}
-int lane_marks[8] = {}, any_changed = 0;
-for (int lane = 0; lane < count; ++lane) {
-    Four low0 = infinity, high0 = -infinity, low1 = infinity, high1 = -infinity;
-    auto finite = low0 == low0;
-    double pad = 0.0;
-    int mark = !changed.data;
-    for (int i = 0; i < corners; ++i) {
-        const int corner = element[8 + 8 * i + lane];
-        const Four start = load(x0, corner), end = load(x1, corner);
-        finite &= (__builtin_elementwise_abs(start) < infinity) & (__builtin_elementwise_abs(end) < infinity);
-        low0 = __builtin_elementwise_min(low0, start);
-        high0 = __builtin_elementwise_max(high0, start);
-        low1 = __builtin_elementwise_min(low1, end);
-        high1 = __builtin_elementwise_max(high1, end);
+// low and high at the start, then at the end, of the elements in lanes; missing ones are as the first
+Scalars ends[4][3];
+const Scalars infinity = __builtin_inf();
+auto finite = infinity == infinity;
+Doubles pad = 0.0;
+Ints lane_marks = changed.data ? 0 : 1;
+for (int i = 0; i < tree.corners; ++i) {
+    int corners_of_lanes[8], largest = 0;
+    for (int lane = 0; lane < 8; ++lane) {
+        const int corner = corners_of_lanes[lane] = element[8 + 8 * i + (lane < count ? lane : 0)];
+        largest = greater(largest, corner);
         if (padding.data)
-            pad = padding.data[corner] > pad ? padding.data[corner] : pad;
+            pad[lane] = greater((double)pad[lane], padding.data[corner]);
         if (changed.data)
-            mark = changed.data[corner] > mark ? changed.data[corner] : mark;
+            lane_marks[lane] = greater((signed)lane_marks[lane], changed.data[corner]);
     }
-    lane_marks[lane] = mark;
-    any_changed |= mark != 0;
-    if (!(finite[0] && finite[1] && finite[2]))
-        continue;  // an empty box overlaps none
-    const Row four[4] = {rounded(low0, -pad), rounded(high0, pad), rounded(low1, -pad), rounded(high1, pad)};
-    for (int row = 0; row < 4; ++row) {
-        whole[row] = row % 2 ? __builtin_elementwise_max(whole[row], four[row])
-                             : __builtin_elementwise_min(whole[row], four[row]);
-        for (int axis = 0; axis < 3; ++axis)
-            rows[4 * axis + row][lane] = four[row][axis];
-    }
-}
-for (int row = 0; row < 4; ++row)
+    Scalars points[6];
+    auto corner = [&](int lane) { return corners_of_lanes[lane]; };
+    read_coordinates(x0, corner, largest < last, points);
+    read_coordinates(x1, corner, largest < last, points + 3);
     for (int axis = 0; axis < 3; ++axis)
-        node[32 * axis + 8 * row] = whole[row][axis];
-__builtin_memcpy(box, rows, sizeof(rows));
-__builtin_memcpy(elements.data + 48 * (size_t)packet + 40, lane_marks, sizeof(lane_marks));
-marks[16] = any_changed;
+        for (int end = 0; end < 2; ++end) {
+            const Scalars x = points[3 * end + axis];
+            Scalars &low = ends[2 * end][axis], &high = ends[2 * end + 1][axis];
+            finite &= __builtin_elementwise_abs(x) < infinity;
+            low = i ? lesser(low, x) : x;
+            high = i ? greater(high, x) : x;
+        }
+}
+const Ints lanes = {0, 1, 2, 3, 4, 5, 6, 7}, present = lanes < count;
+const Ints filled = __builtin_convertvector(finite, Ints) & present;
+lane_marks &= present;
+for (int row = 0; row < 4; ++row)
+    for (int axis = 0; axis < 3; ++axis) {
+        // to single precision, to nearest: rounding and clamping keep order; -0 becomes 0
+        const Doubles largest = 3.4028234663852886e38;
+        const Doubles moved = __builtin_convertvector(ends[row][axis], Doubles) + (row % 2 ? pad : -pad);
+        const Doubles clamped = greater(lesser(moved, largest), -largest);
+        Row values = __builtin_convertvector(clamped, Row) + 0.0f;
+        const Row empty = row % 2 ? -__builtin_inff() : __builtin_inff();  // overlaps no box
+        values = filled ? values : empty;
+        *(Row*)(box + 32 * axis + 8 * row) = values;
+        auto outer = [&](Row a, Row b) { return row % 2 ? greater(a, b) : lesser(a, b); };
+        values = outer(values, __builtin_shufflevector(values, values, 4, 5, 6, 7, 0, 1, 2, 3));
+        values = outer(values, __builtin_shufflevector(values, values, 2, 3, 0, 1, 6, 7, 4, 5));
+        node[32 * axis + 8 * row] = outer(values, __builtin_shufflevector(values, values, 1, 0, 3, 2, 5, 4, 7, 6))[0];
+    }
+*(Ints*)(element + 40) = lane_marks;
+marks[16] = __builtin_reduce_or(lane_marks) != 0;

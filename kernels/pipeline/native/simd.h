@@ -1,17 +1,17 @@
-// Vectors of eight numbers, and the points of eight pairs. Of x0, x1, elements, pairs; Scalar, vertex_face.
+// Vectors of eight numbers, and the points of eight pairs. Of elements, pairs; vertex_face; after positions.h.
 
-typedef Scalar Scalars __attribute__((ext_vector_type(8)));
-typedef Scalar Loaded __attribute__((ext_vector_type(4), aligned(sizeof(Scalar))));
 typedef double Doubles __attribute__((ext_vector_type(8)));
 typedef decltype(Doubles() < Doubles()) Longs;
+typedef int Ints __attribute__((ext_vector_type(8), aligned(4)));
 typedef bool Bools __attribute__((ext_vector_type(8)));
 struct Vectors {
     Doubles x, y, z;
 };
 
 auto bits = [](auto mask) -> int { return __builtin_bit_cast(unsigned char, __builtin_convertvector(mask, Bools)); };
-auto least = [](Doubles a, Doubles b) { return __builtin_elementwise_min(a, b); };
-auto most = [](Doubles a, Doubles b) { return __builtin_elementwise_max(a, b); };
+// one instruction each, unlike __builtin_elementwise_min, which prefers numbers to NaN in either argument
+auto least = [](Doubles a, Doubles b) { return b < a ? b : a; };
+auto most = [](Doubles a, Doubles b) { return b > a ? b : a; };
 auto absolute = [](Doubles a) { return __builtin_elementwise_abs(a); };
 auto larger = [=](Doubles a, Doubles b) { return most(absolute(a), absolute(b)); };
 auto sizes = [=](Vectors a, Vectors b) { return Vectors{larger(a.x, b.x), larger(a.y, b.y), larger(a.z, b.z)}; };
@@ -23,68 +23,48 @@ auto cross = [](Vectors a, Vectors b) {
     return Vectors{a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
 };
 
-auto corners_of = [&](int slot, int* corner) {
-    const int* pair = (const int*)pairs.data + 2 * (size_t)slot;
+// loaded as vectors: of single numbers, the compiler would make gathers, which take longer
+typedef int Two __attribute__((ext_vector_type(2), aligned(4)));
+typedef int Four __attribute__((ext_vector_type(4)));
+auto corners_of = [&](int slot) -> Four {
+    const Two pair = *((const Two*)pairs.data + slot);
     if (vertex_face) {
         const int* face = elements.data + 3 * (size_t)pair[1];
-        corner[0] = pair[0], corner[1] = face[0], corner[2] = face[1], corner[3] = face[2];
-    } else {
-        const int* edge = elements.data + 2 * (size_t)pair[0];
-        const int* other = elements.data + 2 * (size_t)pair[1];
-        corner[0] = edge[0], corner[1] = edge[1], corner[2] = other[0], corner[3] = other[1];
+        const Two rest = *(const Two*)(face + 1);
+        return Four{pair[0], face[0], rest[0], rest[1]};
     }
+    return __builtin_shufflevector(*((const Two*)elements.data + pair[0]), *((const Two*)elements.data + pair[1]), 0, 1,
+                                   2, 3);
 };
 
-// positions may be a view, with any stride; x y z are read with a fourth number where there is one
-auto position = [](const auto& x, int corner) {
-    return (const Scalar*)((const char*)x.data + x.strides[0] * (wp::int64)corner);
+// the points of up to eight pairs, whose slots a function has by lane, as the coordinates of all eight
+struct Points {
+    Scalars x[24];
 };
-const bool forward = x0.strides[0] >= 3 * (int)sizeof(Scalar) && x1.strides[0] >= 3 * (int)sizeof(Scalar);
-const int last = forward ? (x0.shape[0] < x1.shape[0] ? x0.shape[0] : x1.shape[0]) - 1 : -1;
-auto both = [](const Scalar* a, const Scalar* b, bool has_fourth) -> Scalars {
-    if (has_fourth)
-        return __builtin_shufflevector(*(const Loaded*)a, *(const Loaded*)b, 0, 1, 2, 3, 4, 5, 6, 7);
-    return Scalars{a[0], a[1], a[2], 0, b[0], b[1], b[2], 0};
-};
-
-// reads the points of the pairs in the slots of eight lanes, transposed to the coordinates of all eight
-auto read_points = [&](auto slot, Scalars* points) {
-    int corners[4][8], largest = 0;
+auto read_points = [&](auto slot, int filled) -> Points {
+    Points points;
+    Four corners[8], largest = 0;
     for (int lane = 0; lane < 8; ++lane) {
-        int corner[4];
-        corners_of(slot(lane), corner);
-        for (int i = 0; i < 4; ++i) {
-            corners[i][lane] = corner[i];
-            largest = corner[i] > largest ? corner[i] : largest;
-        }
+        corners[lane] = corners_of(slot(lane < filled ? lane : 0));
+        largest = __builtin_elementwise_max(largest, corners[lane]);
     }
-    const bool has_fourth = largest < last;
-    auto read = [&](const auto& x, const int* corner, Scalars* to) {
-        auto row = [&](int lane) { return both(position(x, corner[lane]), position(x, corner[lane + 4]), has_fourth); };
-        const Scalars a = row(0), b = row(1), c = row(2), d = row(3);
-        const Scalars xz = __builtin_shufflevector(a, b, 0, 8, 2, 10, 4, 12, 6, 14);
-        const Scalars more_xz = __builtin_shufflevector(c, d, 0, 8, 2, 10, 4, 12, 6, 14);
-        const Scalars y = __builtin_shufflevector(a, b, 1, 9, 3, 11, 5, 13, 7, 15);
-        const Scalars more_y = __builtin_shufflevector(c, d, 1, 9, 3, 11, 5, 13, 7, 15);
-        to[0] = __builtin_shufflevector(xz, more_xz, 0, 1, 8, 9, 4, 5, 12, 13);
-        to[1] = __builtin_shufflevector(y, more_y, 0, 1, 8, 9, 4, 5, 12, 13);
-        to[2] = __builtin_shufflevector(xz, more_xz, 2, 3, 10, 11, 6, 7, 14, 15);
-    };
+    const bool has_fourth = __builtin_reduce_max(largest) < last;
     for (int i = 0; i < 4; ++i) {
-        read(x0, corners[i], points + 3 * i);
-        read(x1, corners[i], points + 12 + 3 * i);
+        auto corner = [&](int lane) { return corners[lane][i]; };
+        read_coordinates(x0, corner, has_fourth, points.x + 3 * i);
+        read_coordinates(x1, corner, has_fourth, points.x + 12 + 3 * i);
     }
+    return points;
 };
 
 // the differences u, v, w of eight pairs at both ends
 struct Relative {
     Vectors u0, v0, w0, u1, v1, w1;
 };
-auto relative = [&](const Scalars* points) -> Relative {
+auto relative = [&](const Points& points) -> Relative {
     auto point = [&](int i) {
-        return Vectors{__builtin_convertvector(points[3 * i], Doubles),
-                       __builtin_convertvector(points[3 * i + 1], Doubles),
-                       __builtin_convertvector(points[3 * i + 2], Doubles)};
+        auto coordinate = [&](int axis) { return __builtin_convertvector(points.x[3 * i + axis], Doubles); };
+        return Vectors{coordinate(0), coordinate(1), coordinate(2)};
     };
     if (vertex_face)
         return {minus(point(2), point(1)), minus(point(3), point(1)), minus(point(0), point(1)),

@@ -43,7 +43,7 @@ struct Motion {
     Vectors u0, v0, w0, u1, v1, w1, u_size, v_size, w_size;
     Doubles scale;
 };
-auto scaled_motion = [&](const Scalars* points, int& usable) -> Motion {
+auto scaled_motion = [&](const Points& points, int& usable) -> Motion {
     Relative r = relative(points);
     Vectors u = sizes(r.u0, r.u1), v = sizes(r.v0, r.v1), w = sizes(r.w0, r.w1);
     const Doubles size = most(largest_of(u), most(largest_of(v), largest_of(w)));
@@ -53,7 +53,7 @@ auto scaled_motion = [&](const Scalars* points, int& usable) -> Motion {
         typedef unsigned Words __attribute__((ext_vector_type(8)));
         Words smallest = 0xffffffffu;
         for (int i = 0; i < 24; ++i) {  // zero becomes the largest number
-            const Words word = __builtin_bit_cast(Words, __builtin_convertvector(points[i], Floats)) & 0x7fffffffu;
+            const Words word = __builtin_bit_cast(Words, __builtin_convertvector(points.x[i], Floats)) & 0x7fffffffu;
             smallest = __builtin_elementwise_min(smallest, word - 1u);
         }
         usable &= bits(smallest >= 0x007fffffu);

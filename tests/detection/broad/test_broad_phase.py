@@ -99,6 +99,17 @@ def test_all_pairs_are_found_once(broad_phase, dtype, faces, size, worlds, flat,
 
 
 @pytest.mark.parametrize("broad_phase", [BroadPhaseSimd, BroadPhaseHierarchy])
+@pytest.mark.parametrize("rounded_to_zero", [-1e-60, -0.0, 0.0, 1e-60])
+def test_zeros_of_both_signs_are_one(broad_phase, rounded_to_zero):
+    x = np.array([[-1, 0, 0], [rounded_to_zero, 0, 1], [-1, 1, 0], [1, 0, 0], [0, 0, 1], [1, 1, 0]])
+    mesh = bsc.CollisionMesh([[0, 1, 2], [3, 4, 5]], 6)
+    for ends in (x, x), (-x, -x):
+        pairs = find_pairs(broad_phase, mesh, *ends)
+        assert pairs == all_pairs(mesh, *ends)
+        assert all(pairs)
+
+
+@pytest.mark.parametrize("broad_phase", [BroadPhaseSimd, BroadPhaseHierarchy])
 def test_trees_of_several_levels(broad_phase):
     """A strip long enough for four levels of packets, whose pairs are known by counting."""
     n = 6000

@@ -7,10 +7,10 @@ import numpy as np
 import warp as wp
 
 from ..mesh import CollisionMesh
-from ..run.launch import launch
+from ..run.launch import launch, launch_together
 from ..run.settings import UNLIMITED
 from .face_hierarchy import round_kernel
-from .wide_tree import WideTree, sort_trees
+from .wide_tree import WideTree, fit_trees, sort_trees
 
 
 class BroadPhaseSimd:
@@ -75,36 +75,37 @@ class BroadPhaseSimd:
             trees.append(self._edges_of_faces)
         self._build(trees, x0, x1, changed)
         options = {"keep_separated": keep_separated, "filtered_of_worlds": self._filtered_of_worlds}
-        self._vertices.pair(self._faces, *out[:2], **options)
-        self._edges.pair(self._edges, *out[2:4], ordered=True, **options)
+        pairings = [self._vertices.pairing(self._faces, *out[:2], **options)]
+        pairings.append(self._edges.pairing(self._edges, *out[2:4], ordered=True, **options))
         if self._edges_of_faces:
-            self._edges.pair(self._edges_of_faces, *out[2:4], ordered=True, **options)
+            pairings.append(self._edges.pairing(self._edges_of_faces, *out[2:4], ordered=True, **options))
         if self._points and self._free_edges and out[4:]:
             self._build([self._points, self._free_edges], x0, x1, changed)
-            self._points.pair(self._free_edges, *out[4:6], **options)
-            self._points.pair(self._points, *out[6:], ordered=True, **options)
-        if self._not_finite is not None:
+            pairings.append(self._points.pairing(self._free_edges, *out[4:6], **options))
+            pairings.append(self._points.pairing(self._points, *out[6:], ordered=True, **options))
+        launch_together(pairings, device=x0.device, chunk=64)
+        if self._not_finite is not None and not all(np.isfinite(x.numpy()).all() for x in (x0, x1)):
             inputs, outputs = [x0, x1, self._checked], [None, self._not_finite]
             options = {"device": x0.device, "record_tape": False}
             launch(round_kernel(x0.dtype), self._vertex_count, inputs=inputs, outputs=outputs, **options)
 
     def pair_vertices_with_faces(self, counts: wp.array, pairs: wp.array) -> None:
         """Enqueues the (vertex, face) whose boxes in the last run overlap, with arguments as of the others."""
-        self._vertices.pair(self._faces, counts, pairs, keep_separated=True)
+        pairings = [self._vertices.pairing(self._faces, counts, pairs, keep_separated=True)]
+        launch_together(pairings, device=pairs.device, chunk=64)
 
     def pair_edges_with_faces(self, x: wp.array, counts: wp.array, pairs: wp.array, *, is_end: bool = False) -> None:
         """Enqueues the pairs (edge, face) of one configuration that share no vertex and whose boxes overlap."""
         if not is_end:
             self._build([self._edges, self._faces], x, x)
-        self._edges.pair(self._faces, counts, pairs, at_end=True)
+        pairings = [self._edges.pairing(self._faces, counts, pairs, at_end=True)]
+        launch_together(pairings, device=pairs.device, chunk=64)
 
     def _build(self, trees: Sequence[WideTree], x0: wp.array, x1: wp.array, changed: wp.array | None = None) -> None:
         """Fits the boxes of trees to a motion; sorts trees that never were, or whose boxes have become loose."""
         if all(tree.is_sorted for tree in trees):
-            for tree in trees:
-                tree.fit(x0, x1, changed)
+            fit_trees(trees, x0, x1, changed)
             if not any(tree.is_loose for tree in trees):
                 return
         sort_trees(trees, x0, x1, self._used)
-        for tree in trees:
-            tree.fit(x0, x1, changed)
+        fit_trees(trees, x0, x1, changed)

@@ -4,15 +4,14 @@ The trees are those of :mod:`warp_bsc.kernels.pipeline.wide_bvh`. Elements are s
 with 2^10 cells an axis, world by world. Along a Morton curve, packets are larger, and a third more of them overlap.
 """
 
-import itertools
 from collections.abc import Sequence
 
 import numpy as np
 import warp as wp
 
 from ...kernels.pairs import PairFilter
-from ...kernels.pipeline.wide_bvh import fit_packet_of, pair_packet
-from ..run.launch import launch_over, made_once
+from ...kernels.pipeline.wide_bvh import WideBvh, fit_packet_of, pair_packet
+from ..run.launch import Launch, launch_over, launch_together, made_once
 from ..run.settings import NO_GRADIENTS, Count
 
 _CODE_BITS = 10
@@ -48,18 +47,6 @@ def hilbert_transpose(cells: wp.vec3i) -> wp.vec3i:
         if (cells[2] >> bit) & 1 == 1:
             turned = turned ^ ((1 << bit) - 1)
     return wp.vec3i(cells[0] ^ turned, cells[1] ^ turned, cells[2] ^ turned)
-
-
-@wp.struct
-class _Tree:
-    """A tree, whose packets have eight elements each, and whose nodes have eight packets or nodes each."""
-
-    boxes: wp.array[wp.float32]
-    elements: wp.array[int]
-    corners: int  # of an element
-    nodes: wp.array[wp.float32]
-    node_marks: wp.array[int]
-    level_starts: wp.array[int]
 
 
 @made_once
@@ -106,13 +93,12 @@ def _kernels(dtype: type) -> tuple[wp.Kernel, wp.Kernel]:
         changed: wp.array[int],
         padding: wp.array[wp.float64],
         # in and out
-        tree: _Tree,
+        tree: WideBvh,
     ):
         """Writes the boxes of each packet, and its entry in its node."""
         packet = first + wp.tid()
         lanes = wp.min(8, count - 8 * packet)
-        elements, boxes = tree.elements, tree.boxes
-        fit_packet(packet, lanes, x0, x1, tree.corners, changed, padding, elements, boxes, tree.nodes, tree.node_marks)
+        fit_packet(packet, lanes, x0, x1, changed, padding, tree)
 
     return encode, fit_packets
 
@@ -145,8 +131,8 @@ def _fill_packets(
 @wp.kernel(**NO_GRADIENTS)
 def _pair_packets(
     first: int,
-    tree: _Tree,
-    traversed: _Tree,
+    tree: WideBvh,
+    traversed: WideBvh,
     # options
     pair_filter: PairFilter,
     symmetric: int,
@@ -161,17 +147,9 @@ def _pair_packets(
     """Enqueues the pairs of a packet's elements with those of a tree, a packet a thread."""
     pair_packet(
         first + wp.tid(),
-        tree.boxes,
-        tree.elements,
-        tree.corners,
-        traversed.boxes,
-        traversed.elements,
-        traversed.corners,
-        traversed.nodes,
-        traversed.node_marks,
-        traversed.level_starts,
-        pair_filter.group,
-        pair_filter.mask,
+        tree,
+        traversed,
+        pair_filter,
         symmetric,
         ordered,
         keep_separated,
@@ -242,13 +220,11 @@ class WideTree:
         self._filter = PairFilter() if pair_filter is None else pair_filter
         n = len(corners)
         packets = -(-n // 8)
-        starts = [0]
-        width = packets
-        while True:
+        width = -(-packets // 8)
+        starts = [0, width]
+        while width > 1:
             width = -(-width // 8)
             starts.append(starts[-1] + width)
-            if width <= 1:
-                break
         worlds = np.zeros(n, np.int32) if world is None else world[corners[:, 0]]
         device = "cpu"
         self._corners = wp.array(corners, dtype=int, device=device)
@@ -262,7 +238,8 @@ class WideTree:
         self._elements = wp.full((packets, 48), -1, dtype=int, device=device)
         self._nodes = wp.array(np.tile(empty, (starts[-1], 6, 8)), dtype=wp.float32, device=device)
         self._node_marks = wp.full((starts[-1], 3, 8), -1, dtype=int, device=device)
-        self._tree = tree = _Tree()
+        self._starts = starts
+        self._tree = tree = WideBvh()
         tree.corners, tree.level_starts = corners.shape[1], wp.array(starts, dtype=int, device=device)
         for name in ("boxes", "elements", "nodes", "node_marks"):
             setattr(tree, name, getattr(self, f"_{name}").flatten())
@@ -288,22 +265,15 @@ class WideTree:
         launch_over(_fill_packets, len(self._boxes), inputs=inputs, outputs=outputs, device=device, chunk=2048)
         self._sorted_size, self.is_sorted = 0.0, True
 
-    def fit(self, x0: wp.array, x1: wp.array, changed: wp.array | None = None) -> None:
-        """Fits packets and nodes to a motion; arguments as of :meth:`.BroadPhaseHierarchy.pair_elements`."""
-        _, fit_packets = _kernels(x0.dtype)
-        inputs, device = [x0, x1, len(self._corners), changed, self._padding], self._corners.device
-        launch_over(fit_packets, len(self._boxes), inputs=inputs, outputs=[self._tree], device=device, chunk=2048)
-        starts = self._tree.level_starts.numpy().tolist()
-        rows = self._nodes.numpy()[: starts[1]].reshape(-1, 3, 4, 8)
+    def measure(self) -> None:
+        """Computes the size of all packets, after they were fitted."""
+        rows = self._nodes.numpy()[: self._starts[1]].reshape(-1, 3, 4, 8)
         with np.errstate(over="ignore"):
             sizes = np.maximum(rows[:, :, 1], rows[:, :, 3]) - np.minimum(rows[:, :, 0], rows[:, :, 2])
         self._size = float(np.clip(sizes, 0.0, np.finfo(np.float32).max).sum(dtype=np.float64))
         self._sorted_size = self._sorted_size or self._size
-        for start, above in itertools.pairwise(starts[:-1]):
-            inputs, outputs = [start, above], [self._nodes, self._node_marks]
-            launch_over(_join_nodes, above - start, inputs=inputs, outputs=outputs, device=device, chunk=2048)
 
-    def pair(
+    def pairing(
         self,
         other: "WideTree",
         counts: wp.array,
@@ -313,8 +283,8 @@ class WideTree:
         keep_separated: bool = False,
         at_end: bool = False,
         filtered_of_worlds: wp.array | None = None,
-    ) -> None:
-        """Enqueues the candidates between this tree and another, or within this tree.
+    ) -> Launch:
+        """Returns the launch that enqueues the candidates between this tree and another, or within this tree.
 
         Args:
             other: The other tree, or this tree.
@@ -325,11 +295,25 @@ class WideTree:
             at_end: Whether to enqueue the pairs that overlap at the end of the motion.
             filtered_of_worlds: Counts of the pairs that are left out, by world, array of int64; None for none.
         """
-        if not len(other._boxes):
-            return
         options = [self._filter, other is self, ordered, keep_separated, at_end]
         inputs = [self._tree, other._tree, *options, counts, filtered_of_worlds]
-        launch_over(_pair_packets, len(self._boxes), inputs=inputs, outputs=[pairs], device=pairs.device, chunk=64)
+        return _pair_packets, len(self._boxes) if len(other._boxes) else 0, inputs, [pairs]
+
+
+def fit_trees(trees: Sequence[WideTree], x0: wp.array, x1: wp.array, changed: wp.array | None) -> None:
+    """Fits packets and nodes of trees to a motion; arguments as of :meth:`.BroadPhaseHierarchy.pair_elements`."""
+    _, fit_packets = _kernels(x0.dtype)
+    inputs = [[x0, x1, len(tree._corners), changed, tree._padding] for tree in trees]
+    fits = [(fit_packets, len(tree._boxes), of_tree, [tree._tree]) for tree, of_tree in zip(trees, inputs, strict=True)]
+    launch_together(fits, device=x0.device, chunk=256)
+    for level in range(max(len(tree._starts) for tree in trees) - 2):
+        joins = []
+        for tree in (tree for tree in trees if level < len(tree._starts) - 2):
+            start, above = tree._starts[level : level + 2]
+            joins.append((_join_nodes, above - start, [start, above], [tree._nodes, tree._node_marks]))
+        launch_together(joins, device=x0.device, chunk=512)
+    for tree in trees:
+        tree.measure()
 
 
 def sort_trees(trees: Sequence[WideTree], x0: wp.array, x1: wp.array, used: np.ndarray | slice) -> None:

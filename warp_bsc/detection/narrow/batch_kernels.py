@@ -16,7 +16,7 @@ from ...kernels.pipeline.batch_classification import OPEN, classify_batch_of
 from ...kernels.pipeline.batch_culling import BATCH, cull_batch_of
 from ...kernels.pipeline.batch_impacts import BATCH as DECIDED
 from ...kernels.pipeline.batch_impacts import impact_batch_of
-from ...kernels.pipeline.queues import filled_entries, raise_count, take_slots, write
+from ...kernels.pipeline.queues import filled_entries, raise_count, take_slot, take_slots, write
 from ...kernels.polynomials import coplanarity
 from ...kernels.signs import FREE, HIT, UNSURE
 from ...kernels.time_of_impact import clamped_tolerance, impact, power_of_two
@@ -142,27 +142,20 @@ def batch_classification_kernel(kind: PairKind, dtype: type) -> wp.Kernel:
 
 @wp.func
 def _decide_batch(first: int, count: int, timed: bool, touching: wp.uint64, buffers: PairBuffers):
-    """Decides contacts as the kernel of a GPU does, with one atomic operation for each count."""
+    """Decides contacts as the kernel of a GPU does, with one atomic operation for the counts of all."""
     contacts = buffers.contacts
     found = int(0)
     unsure = int(0)
-    queued = int(0)
     for i in range(first, first + count):
         status = int(contacts.status[i])
         is_touching = (touching >> wp.uint64(i - first)) & wp.uint64(1) == wp.uint64(1)
         write_decision(i, wp.where(is_touching, HIT, status), buffers)
         found += int(status != FREE)
         unsure += int(status == UNSURE)
-        queued += int(status == UNSURE or (status == HIT and timed and not contacts.within_tolerance[i]))
+        if status == UNSURE or (status == HIT and timed and not contacts.within_tolerance[i]):
+            buffers.for_exact[wp.int32(take_slot(buffers.counts, Count.FOR_EXACT))] = i
     raise_count(buffers.counts, Count.FOUND, found)
     raise_count(buffers.counts, Count.UNSURE, unsure)
-    if queued > 0:
-        slot = wp.int32(take_slots(buffers.counts, Count.FOR_EXACT, queued))
-        for i in range(first, first + count):
-            status = int(contacts.status[i])
-            if status == UNSURE or (status == HIT and timed and not contacts.within_tolerance[i]):
-                buffers.for_exact[slot] = i
-                slot += 1
 
 
 @made_once

@@ -266,6 +266,24 @@ def pad_keys(
         keys[i] = last_key
 
 
+@wp.func_native(
+    snippet="""
+#if !defined(__CUDA_ARCH__)
+    const size_t row = i < order.shape[0] ? order.data[i] : 0;  // any: what is at no address is not loaded
+    __builtin_prefetch(&contacts.pairs.data[row]);
+    __builtin_prefetch(&contacts.toi.data[row]);
+    for (int byte = 0; byte < 32; byte += 16) {  // a vector may be on two cache lines
+        __builtin_prefetch((char*)&contacts.coordinates.data[row] + byte);
+        __builtin_prefetch((char*)&contacts.normal.data[row] + byte);
+    }
+#endif
+"""
+)
+def _prefetch(i: int, order: wp.array[int], contacts: ContactBuffer):
+    """Makes a CPU load a row of contacts that is needed soon."""
+    ...
+
+
 @wp.kernel(**NO_GRADIENTS)
 def gather_contacts(
     first: int,
@@ -281,6 +299,7 @@ def gather_contacts(
     if wp.int64(i) >= counts[Count.FOUND] - counts[Count.REFUTED]:
         ordered.pairs[i] = wp.vec2i(-1, -1)
         return
+    _prefetch(i + 24, order, contacts)
     source = order[i]
     ordered.pairs[i] = contacts.pairs[source]
     ordered.status[i] = contacts.status[source]

@@ -31,6 +31,9 @@ _KERNELS = threading.RLock()
 _loaded: weakref.WeakKeyDictionary[wp.Kernel, set[tuple[str, int]]] = weakref.WeakKeyDictionary()
 """Devices and thread block sizes for which a kernel has been launched; 0 for the default size, as on the CPU."""
 
+Launch = tuple[wp.Kernel, int, list, list]
+"""A kernel with its number of threads, its inputs, without the first where a part starts, and its outputs."""
+
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
 
@@ -83,24 +86,16 @@ def launch_in_turn(kernel: wp.Kernel, dim: int, times: int, *, inputs: list, val
     return values[times % 2 if dim else 0]
 
 
-def launch_repeatedly(
-    kernels: Sequence[tuple[wp.Kernel, int, list, list]], times: int, *, device: wp.DeviceLike
-) -> None:
+def launch_repeatedly(kernels: Sequence[Launch], times: int, *, device: wp.DeviceLike) -> None:
     """Launches kernels one after the other, several times.
 
     Args:
-        kernels: Kernels with their numbers of threads, their inputs and their outputs.
+        kernels: The kernels, with all of their inputs.
         times: How often to launch all.
         device: The device of their arrays.
     """
     device = wp.get_device(device)
-    commands = []
-    for kernel, dim, inputs, outputs in kernels:
-        if dim:
-            with _loading(kernel, device, 0):
-                commands.append(
-                    wp.launch(kernel, dim, inputs, outputs, device=device, record_tape=False, record_cmd=True)
-                )
+    commands = [_command(*arguments, device) for arguments in kernels if arguments[1]]
     for _ in range(times):
         for command in commands:
             command.launch()
@@ -170,13 +165,24 @@ def launch_over(
         options = {"max_blocks": max_blocks, "block_dim": block_dim, "record_tape": False}
         launch(kernel, count, inputs=[0, *inputs], outputs=outputs, device=device, **options)
         return
+    launch_together([(kernel, count, inputs, outputs)], device=device, chunk=chunk)
+
+
+def launch_together(kernels: Sequence[Launch], *, device: wp.Device, chunk: int = 1024) -> None:
+    """Launches kernels on all cores of the CPU, as :func:`launch_over` one, in no order: no core waits between them."""
     if device.is_capturing:
         raise RuntimeError("a graph on the CPU cannot capture this, as the host reads results between launches")
-    if not count:
-        return
-    threads = cores_for(kernel, device)
-    chunk = max(chunk, -(-count // (8 * threads if threads > 1 else 1)))
-    _run(kernel, count, chunk, threads, inputs=[0, *inputs], outputs=outputs, device=device, has_first=True)
+    left = sum(count for _, count, _, _ in kernels)
+    threads = min((cores_for(kernel, device) for kernel, *_ in kernels), default=1)
+    parts = []
+    for kernel, count, inputs, outputs in kernels:
+        first, command = 0, _command(kernel, count, [0, *inputs], outputs, device) if count else None
+        while first < count:
+            # a share of what is left, so that the last parts are small, and all threads end at about the same time
+            part = min(count - first, max(chunk, -(-left // (2 * threads if threads > 1 else 1))))
+            parts.append((command, first, part))
+            first, left = first + part, left - part
+    _run(parts, threads)
 
 
 def launch_on_cores(
@@ -187,7 +193,8 @@ def launch_on_cores(
     if device.is_cuda or min(threads, count) <= 1:
         launch(kernel, count, inputs=inputs, outputs=outputs, device=device, block_dim=block_dim)
         return
-    _run(kernel, count, -(-count // (8 * threads)), threads, inputs=inputs, outputs=outputs, device=device)
+    command, part = _command(kernel, count, inputs, outputs, device), -(-count // (8 * threads))
+    _run([(command, None, min(part, count - first)) for first in range(0, count, part)], threads)
 
 
 def cores_for(kernel: wp.Kernel, device: wp.Device) -> int:
@@ -195,27 +202,30 @@ def cores_for(kernel: wp.Kernel, device: wp.Device) -> int:
     return _threads.get(count_cores()) if may_run_in_threads(kernel) and not device.is_capturing else 1
 
 
-def _run(kernel: wp.Kernel, count: int, chunk: int, threads: int, has_first: bool = False, **options: Any) -> None:
-    """Runs parts of a launch in this thread and, as soon as they are free, in others, so that short ones wait for none.
+def _command(kernel: wp.Kernel, count: int, inputs: list, outputs: Sequence[Any], device: wp.Device) -> wp.Launch:
+    """Returns a launch with its arguments packed, which takes longer than many a part of it."""
+    with _loading(kernel, device, 0):
+        return wp.launch(kernel, count, inputs, outputs, device=device, record_tape=False, record_cmd=True)
 
-    The others only run commands: Warp cannot load a kernel and pack its arguments in several threads at once.
+
+def _run(parts: Sequence[tuple[wp.Launch, int | None, int]], threads: int) -> None:
+    """Runs parts of launches in this thread and, as soon as they are free, in others, so that short ones wait for none.
+
+    The others only run commands: Warp cannot load a kernel and pack arrays in several threads at once. A part is a
+    launch with its first argument there, None for that of all, and its number of threads.
     """
-    with _loading(kernel, options["device"], 0):
-        commands = [wp.launch(kernel, min(chunk, count), record_tape=False, record_cmd=True, **options)]
-    for first in range(chunk, count, chunk):  # to pack all arguments again would take longer than many a chunk
-        command = copy.copy(commands[0])
-        command.params = list(command.params)
-        if has_first:
-            command.set_param_at_index(0, first)
-        command.set_dim(min(chunk, count - first))
-        commands.append(command)
-    waiting = iter(commands)
+    waiting = iter(parts)
 
     def work() -> None:
-        for command in waiting:
+        for whole, first, count in waiting:
+            command = copy.copy(whole)
+            command.params = list(command.params)
+            if first is not None:
+                command.set_param_at_index(0, first)
+            command.set_dim(count)
             command.launch()
 
-    others = [thread_pool(threads).submit(work) for _ in range(min(threads, len(commands)) - 1)]
+    others = [thread_pool(threads).submit(work) for _ in range(min(threads, len(parts)) - 1)]
     try:
         work()
     finally:
@@ -225,14 +235,7 @@ def _run(kernel: wp.Kernel, count: int, chunk: int, threads: int, has_first: boo
 
 
 def launch_over_queue(
-    kernel: wp.Kernel,
-    queue: wp.array,
-    counts: wp.array,
-    count: int,
-    *,
-    inputs: list,
-    outputs: list,
-    block_dim: int = 256,
+    kernel: wp.Kernel, queue: wp.array, counts: wp.array, row: int, *, inputs: list, outputs: list, block_dim: int = 256
 ) -> None:
     """Launches a kernel over a queue: its filled entries on the CPU; its capacity on a GPU, without synchronizing.
 
@@ -242,7 +245,7 @@ def launch_over_queue(
         kernel: The kernel, with a first argument as for :func:`launch_over`.
         queue: The queue.
         counts: Counts of several queues, array of int64.
-        count: Index of the queue's count in it.
+        row: Index of the queue's count in it.
         inputs: Arguments of the kernel after the first.
         outputs: The rest of its arguments.
         block_dim: Threads of a block on a GPU.
@@ -250,7 +253,7 @@ def launch_over_queue(
     device = queue.device
     entries = len(queue)
     if device.is_cpu:
-        entries = min(entries, int(counts.numpy()[count]))
+        entries = min(entries, int(counts.numpy()[row]))
     options = {"device": device, "block_dim": block_dim, "max_blocks": max_blocks(device, block_dim)}
     launch_over(kernel, entries, inputs=inputs, outputs=outputs, **options)
 

@@ -21,7 +21,7 @@ from ....kernels.pipeline.queues import take_slot
 from ....kernels.polynomials import VERTEX_FACE, Motion, coplanarity
 from ....kernels.signs import FREE, HIT, ROUNDOFF, UNSURE, certified_sign_cubic
 from ....kernels.time_of_impact import Impact, impact
-from ...run.launch import launch_over, made_once
+from ...run.launch import launch_together, made_once
 from ...run.phase_timer import PhaseTimer
 from ...run.settings import NO_FUSED_OPERATIONS, TOLERANCE, Count, Method
 from ..batch_kernels import batch_classification_kernel, batch_culling_kernel, batch_impact_kernel
@@ -182,11 +182,12 @@ def run_contacts(
     motion = [x0, x1, options.roundoff]
 
     def launch_batches(kernel_of: Callable, others: list, buffer: str, count: Count, batch: int) -> None:
-        """Launches the kernel of each kind over the filled entries of a buffer, many at a time, on a CPU."""
+        """Launches the kernels of all kinds over the filled entries of a buffer, many at a time, on a CPU."""
+        kernels = []
         for kind, s in buffers.items():
             filled = min(getattr(s, buffer).shape[0], int(s.counts.numpy()[count]))
-            kernel, inputs = kernel_of(kind, x0.dtype), [*motion, *others]
-            launch_over(kernel, -(-filled // batch), inputs=inputs, outputs=[s], device=x0.device, chunk=16)
+            kernels.append((kernel_of(kind, x0.dtype), -(-filled // batch), [*motion, *others], [s]))
+        launch_together(kernels, device=x0.device, chunk=16)
 
     with timer.phase("cull"):
         if is_cpu:
