@@ -20,8 +20,8 @@ struct Packet {
     Doubles kept;
     int all, usable;
 };
-auto read_packet = [&](const int* which, int filled) -> Packet {
-    auto slot = [&](int lane) { return first + which[lane < filled ? lane : 0]; };
+auto read_packet = [&](auto which, int filled) -> Packet {
+    auto slot = [&](int lane) { return first + which(lane < filled ? lane : 0); };
     Doubles distance;
     for (int lane = 0; lane < 8; ++lane) {
         const Four corner = corners_of(slot(lane));
@@ -37,15 +37,10 @@ auto read_packet = [&](const int* which, int filled) -> Packet {
 
 int open[64], open_count = 0;
 for (int begin = 0; begin < count; begin += 8) {
-    int which[8];
-    for (int lane = 0; lane < 8; ++lane)
-        which[lane] = begin + lane;
-    const Packet packet = read_packet(which, count - begin < 8 ? count - begin : 8);
+    const int filled = count - begin < 8 ? count - begin : 8;
+    const Packet packet = read_packet([&](int lane) { return begin + lane; }, filled);
     const Motion& motion = packet.motion;
     const Doubles kept = packet.kept;
-    const int usable = packet.usable;
-
-    // plane
     const Coplanarity y = coplanarity(motion);
     const Doubles error = normal_error * roundoff * (y.uv.x + y.uv.y + y.uv.z) + roundoff * underflow;
     const Doubles norm_0 = norm_bound(y.n0) + error, norm_h = norm_bound(y.nh) + error;
@@ -56,14 +51,13 @@ for (int begin = 0; begin < count; begin += 8) {
         return least(least(k.k0 - far * norm_0, k.k1 - far_1), least(k.k2 - far_2, k.k3 - far * norm_1)) > y_bound;
     };
     const Cubic k = y.k;
-    int unsure = packet.all & ~(bits(above(k) | above({-k.k0, -k.k1, -k.k2, -k.k3})) & usable);
-
+    int unsure = packet.all & ~(bits(above(k) | above({-k.k0, -k.k1, -k.k2, -k.k3})) & packet.usable);
     const Vectors size = plus(plus(motion.u_size, motion.v_size), motion.w_size);
     if (unsure) {
         const Vectors direction = centroid_direction(motion);
         const Gaps gaps = gaps_along(motion, direction);
         const Doubles bound = gap_bound(size, direction), needed = kept * norm_bound(direction);
-        unsure &= ~(bits((gaps.low - bound > needed) | (-gaps.high - bound > needed)) & usable);
+        unsure &= ~(bits((gaps.low - bound > needed) | (-gaps.high - bound > needed)) & packet.usable);
     }
     for (; unsure; unsure &= unsure - 1)
         open[open_count++] = begin + __builtin_ctz(unsure);
@@ -71,12 +65,10 @@ for (int begin = 0; begin < count; begin += 8) {
 
 unsigned long long left = 0;
 for (int begin = 0; begin < open_count; begin += 8) {
-    const Packet packet = read_packet(open + begin, open_count - begin < 8 ? open_count - begin : 8);
+    const int filled = open_count - begin < 8 ? open_count - begin : 8;
+    const Packet packet = read_packet([&](int lane) { return open[begin + lane]; }, filled);
     const Motion& motion = packet.motion;
-    const Doubles kept = packet.kept;
-    const int usable = packet.usable;
     int unsure = packet.all;
-
     // directions between the closest points at some times: each clears the times around its own until a corner
     // comes within the distance along it; those before start and after limit are clear
     Doubles start = 0.0, limit = 1.0;
@@ -90,8 +82,8 @@ for (int begin = 0; begin < open_count; begin += 8) {
         const Corners first = corners_along(direction, motion.u0, motion.v0, motion.w0);
         const Corners last = corners_along(direction, motion.u1, motion.v1, motion.w1);
         const Vectors size = plus(plus(motion.u_size, motion.v_size), motion.w_size);
-        const Doubles bound = gap_bound(size, direction), needed = kept * norm_bound(direction),
-                      more = needed * away + 2.0 * bound;
+        const Doubles bound = gap_bound(size, direction), needed = packet.kept * norm_bound(direction);
+        const Doubles more = needed * away + 2.0 * bound;
         Doubles from = start, until = limit;
         for (int i = 0; i < corner_count; ++i) {
             const Doubles crossing = (more - first.x[i]) / (last.x[i] - first.x[i]);
@@ -111,7 +103,7 @@ for (int begin = 0; begin < open_count; begin += 8) {
         const Longs advances = whole & (from == start), recedes = whole & (until == limit);
         start = where(advances, until, start);
         limit = where(recedes, from, limit);
-        unsure &= ~(bits(start >= limit) & usable);
+        unsure &= ~(bits(start >= limit) & packet.usable);
     }
     for (; unsure; unsure &= unsure - 1)
         left |= 1ull << open[begin + __builtin_ctz(unsure)];

@@ -11,15 +11,10 @@ for (int i = 0; i < count; ++i) {
     const bool has_fourth = __builtin_reduce_max(corner) < last;
     auto ends = [&](int i) { return both(position(x0, corner[i]), position(x1, corner[i]), has_fourth); };
     const Scalars a = ends(0), b = ends(1), c = ends(2), d = ends(3);
-    Scalars low = a, high = a;
-    Scalars other_low = __builtin_elementwise_min(c, d), other_high = __builtin_elementwise_max(c, d);
-    if (vertex_face) {
-        other_low = __builtin_elementwise_min(other_low, b);
-        other_high = __builtin_elementwise_max(other_high, b);
-    } else {
-        low = __builtin_elementwise_min(a, b);
-        high = __builtin_elementwise_max(a, b);
-    }
+    auto lowest = [](Scalars a, Scalars b) { return __builtin_elementwise_min(a, b); };
+    auto highest = [](Scalars a, Scalars b) { return __builtin_elementwise_max(a, b); };
+    const Scalars low = vertex_face ? a : lowest(a, b), other_low = lowest(vertex_face ? lowest(b, c) : c, d);
+    const Scalars high = vertex_face ? a : highest(a, b), other_high = highest(vertex_face ? highest(b, c) : c, d);
     const int above = bits(other_low > high), below = bits(low > other_high);
     const int apart = ((above & (above >> 4)) | (below & (below >> 4))) & 7;
     near_count += apart == 0;
@@ -29,7 +24,6 @@ unsigned long long left = 0;
 for (int begin = 0; begin < near_count; begin += 8) {
     const int filled = near_count - begin < 8 ? near_count - begin : 8;
     const Points points = read_points([&](int lane) { return first + near[begin + lane]; }, filled);
-
     // bounds take longer than signs: only where some lane has one sign; with a roundoff of zero they are zero
     const Relative r = relative(points);
     int unsure = (1 << filled) - 1;
