@@ -165,7 +165,8 @@ class CollisionDetector:
             end.assign(x)
             found = self._finder.find(start, end, keep_separated=True, queued=queued)
             if not found or step == 0.0:
-                return FreeStep(step, _like(x, x1), found.free)
+                reached = wp.array(x, dtype=end.dtype, device=x1.device) if isinstance(x1, wp.array) else x
+                return FreeStep(step, reached, found.free)
             step *= found.earliest_toi * (1.0 - retreat)
             queued, retreat = True, 2.0 * retreat
 
@@ -373,13 +374,6 @@ def _partway(x0: np.ndarray, x1: np.ndarray, share: float, last: np.ndarray) -> 
     with np.errstate(invalid="ignore", over="ignore"):  # of vertices that are not used
         x = ((1.0 - share) * x0.astype(np.float64) + share * x1.astype(np.float64)).astype(x0.dtype)
     return np.clip(x, np.minimum(x0, last), np.maximum(x0, last))
-
-
-def _like(x: np.ndarray, given: ArrayLike | wp.array) -> np.ndarray | wp.array:
-    """Returns positions as a Warp array of vectors where others were given as a Warp array, on its device."""
-    if not isinstance(given, wp.array):
-        return x
-    return wp.array(x, dtype=wp.vec3 if x.dtype == np.float32 else wp.vec3d, device=given.device)
 
 
 def stats_by_world(detector: CollisionDetector, collisions: Collisions) -> list[DetectionStats] | None:

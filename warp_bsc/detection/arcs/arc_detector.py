@@ -3,6 +3,7 @@
 import numpy as np
 import warp as wp
 
+from ..mesh import changed_mesh
 from ..narrow.contact_buffer import ContactRows, contacts_from_host
 from ..pipeline import DetectionPipeline
 from ..results.collision_finder import CollisionFinder
@@ -10,7 +11,7 @@ from ..results.collisions import CapturedCollisions, Collisions
 from ..run.phase_timer import PhaseTimer
 from ..run.settings import add_counts
 from .arc_pipeline import LARGEST_TURN, ArcPipeline
-from .arc_search import ArcSearch, join_contacts, straight_mesh
+from .arc_search import ArcSearch, join_contacts
 from .rigid_motion import ArcBounds, RigidMotion
 
 
@@ -55,8 +56,10 @@ class ArcDetector:
         if self._by_parts is None or not np.array_equal(self._by_parts[0].body, body):
             others = None
             if (body[mesh.vertices] < 0).any():
+                # pairs with a vertex that turns are left out
+                group = np.where(body >= 0, np.uint32(0), np.uint32(1) if mesh.group is None else mesh.group)
                 options = {"method": method, "tolerance": self._straight.tolerance, "only_used_vertices": True}
-                apart = DetectionPipeline(straight_mesh(mesh, body >= 0), **self._distances, **options)
+                apart = DetectionPipeline(changed_mesh(mesh, group=group), **self._distances, **options)
                 others = CollisionFinder(apart, self._straight.broad_phase.lock)
             self._by_parts = ArcSearch(self._straight, body, **self._distances), others
         search, others = self._by_parts

@@ -210,19 +210,12 @@ def points_on_arcs(
     if not (body >= 0).any():
         return straight
     turn = np.where(body[..., None] >= 0, motion.turn[body], 0.0)
-    across, inward = _levers(start - motion.centre[body], turn)
-    angle = np.linalg.norm(turn, axis=-1, keepdims=True)
-    sine = np.sin(time * angle) - time * np.sin(angle)
-    versine = 2.0 * (np.sin(0.5 * time * angle) ** 2 - time * np.sin(0.5 * angle) ** 2)
-    return straight + sine * across + versine * inward
-
-
-def _levers(r: np.ndarray, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns k x r and k x (k x r), with k the unit vector of a turn, each of shape [..., 3]; 0 without a turn."""
     angle = np.linalg.norm(turn, axis=-1, keepdims=True)
     axis = turn / np.where(angle == 0.0, 1.0, angle)
-    across = np.cross(axis, r)
-    return across, np.cross(axis, across)
+    across = np.cross(axis, start - motion.centre[body])
+    sine = np.sin(time * angle) - time * np.sin(angle)
+    versine = 2.0 * (np.sin(0.5 * time * angle) ** 2 - time * np.sin(0.5 * angle) ** 2)
+    return straight + sine * across + versine * np.cross(axis, across)
 
 
 @wp.struct

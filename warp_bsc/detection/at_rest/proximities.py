@@ -152,9 +152,8 @@ class _ProximityQueue:
         """Keeps the candidates that are at most a distance apart, or may be."""
         inputs = [x, int(self.kind), elements, rings, wp.float64(distance), self.candidates]
         outputs = [self.counts, self.pairs, self.distance, self.position]
-        launch_over_queue(
-            _keep_proximities(x.dtype), self.candidates, self.counts, Count.QUEUED, inputs=inputs, outputs=outputs
-        )
+        queue = self.candidates, self.counts, Count.QUEUED
+        launch_over_queue(_keep_proximities(x.dtype), *queue, inputs=inputs, outputs=outputs)
 
 
 class ProximityFinder:
@@ -206,10 +205,9 @@ class ProximityFinder:
         lower, upper = self._enlarge(positions)
         retry_until_fits(lambda: self._launch(x, lower, upper), self, mesh.device)
         found = [self._decide(queue, x, largest) for queue in self._queues]
-        vertex_face, edge_edge, vertex_edge, vertex_vertex = (pairs for pairs, _, _ in found)
         distance, position = (np.concatenate([rows[i] for rows in found]) for i in (1, 2))
         filtered = sum(counts.filtered for counts in self._counters.read().pairs.values())
-        return Proximities(vertex_face, edge_edge, vertex_edge, vertex_vertex, distance, position, filtered)
+        return Proximities(*(pairs for pairs, _, _ in found), distance, position, filtered)
 
     def _decide(self, queue: _ProximityQueue, x: wp.array, largest: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns pairs, distances and positions of a kind, without the pairs that are farther apart."""

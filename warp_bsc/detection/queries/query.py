@@ -7,7 +7,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from ..._arguments import check_finite, check_instance, checked_choice, checked_distances, checked_flag, checked_shape
+from ..._arguments import check_finite, checked_choice, checked_distances, checked_flag, checked_shape
 from ...kernels.signs import FREE, HIT, UNSURE
 from ..narrow.contact_buffer import HostContacts, read_contacts
 from ..narrow.narrow_phase import NarrowPhase
@@ -172,25 +172,9 @@ def query_vertex_vertex(
     return _query(PairKind.VERTEX_VERTEX, points, min_distance, method, toi, tolerance, device)
 
 
-def _query_into(out, kind, points, min_distance, method, timed, tolerance, device) -> DeviceQueryResult:
-    """Decides queries whose results stay on the device."""
-    check_instance(out, "out", DeviceQueryResult, "a DeviceQueryResult")
-    if not isinstance(points, wp.array):
-        raise TypeError(f"points must be a Warp array if there is out, not {type(points).__name__}")
-    checked_choice(method, "method", METHODS)
-    if checked_flag(timed, "toi") != (out.toi is not None):
-        raise ValueError(f"toi must be {out.toi is not None}, as out was made with")
-    if device is not None and checked_device(device) != out.device:
-        raise ValueError(f"device must be that of out, {out.device}, not {device}")
-    if not isinstance(min_distance, (int, float)) or min_distance != 0.0:
-        raise ValueError("min_distance must be 0 if there is out")
-    query_into(out, kind, points, method, checked_tolerance(tolerance))
-    return out
-
-
 def _query(kind, points, min_distance, method, timed, tolerance, device, out=None) -> Any:
     if out is not None:
-        return _query_into(out, kind, points, min_distance, method, timed, tolerance, device)
+        return query_into(out, kind, points, min_distance, method, timed, tolerance, device)
     checked_choice(method, "method", METHODS)
     tolerance = checked_tolerance(tolerance)
     timed = checked_flag(timed, "toi")
@@ -213,10 +197,8 @@ def _query(kind, points, min_distance, method, timed, tolerance, device, out=Non
     all_queued = PairCounts(queued=n)
     # without a distance: the narrow phase of contacts
     contact = kind in SURFACE_KINDS and not distance.any()
-    radius = np.zeros((n, half))
-    radius[:, 0] = distance  # those of the other vertices are 0, so that the sum of two is exact
-    if kind == PairKind.EDGE_EDGE:
-        radius[:, 1] = distance
+    radius = np.zeros((n, half))  # 0 of all vertices but those of the first element, so that the sum of two is exact
+    radius[:, : 2 if kind == PairKind.EDGE_EDGE else 1] = distance.reshape(-1, 1)
     radius = radius.ravel()
     device_radius = wp.array(radius, dtype=wp.float64, device=device)
 
