@@ -325,19 +325,15 @@ class CollisionDetector:
         if arcs is None:
             return None
         check_instance(arcs, "rigid_motion", RigidMotion, "a RigidMotion")
-        if len(arcs.body) != self.mesh.vertex_count:
-            raise ValueError(
-                f"rigid_motion must have a body for {self.mesh.vertex_count} vertices, not {len(arcs.body)}"
-            )
+        if len(arcs.body) != (count := self.mesh.vertex_count):
+            raise ValueError(f"rigid_motion must have a body for {count} vertices, not {len(arcs.body)}")
         return arcs if (arcs.body >= 0).any() else None
 
     def _checked_vertices(self, vertices: ArrayLike) -> wp.array:
         """Returns which vertices are given, on the device, array of int."""
-        mask = as_numpy(vertices, "vertices", "an array of bool")
-        if mask.dtype != bool or mask.shape != (self.mesh.vertex_count,):
-            raise ValueError(
-                f"vertices must be bool of shape ({self.mesh.vertex_count},), not {mask.dtype} {mask.shape}"
-            )
+        mask, shape = as_numpy(vertices, "vertices", "an array of bool"), (self.mesh.vertex_count,)
+        if mask.dtype != bool or mask.shape != shape:
+            raise ValueError(f"vertices must be bool of shape {shape}, not {mask.dtype} {mask.shape}")
         return wp.array(mask, dtype=int, device=self.mesh.device)
 
     def _checked_positions(self, x0: ArrayLike | wp.array, x1: ArrayLike | wp.array) -> tuple[wp.array, wp.array]:
@@ -345,10 +341,8 @@ class CollisionDetector:
         x0 = self.mesh.device_positions(x0, "x0")
         x1 = self.mesh.device_positions(x1, "x1")
         if x0.dtype != x1.dtype:
-            x0_type, x1_type = ("float32" if x.dtype == wp.vec3 else "float64" for x in (x0, x1))
-            raise ValueError(
-                f"x1 must be {x0_type} as x0, not {x1_type}: convert one of them, exactly if it becomes float64"
-            )
+            one, other = ("float32" if x.dtype == wp.vec3 else "float64" for x in (x0, x1))
+            raise ValueError(f"x1 must be {one} as x0, not {other}: convert one of them, exactly if it becomes float64")
         return x0, x1
 
     def _capture_on_cpu(self, x0: wp.array, x1: wp.array, arcs: RigidMotion | None) -> CapturedCollisions:

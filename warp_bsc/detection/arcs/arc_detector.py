@@ -80,15 +80,14 @@ class ArcDetector:
 
         Arguments are those of the last call of :meth:`find`, errors those of :meth:`.CollisionDetector.capture`.
         """
+        outside = "detect outside the graph"
         if self._straight.radius is not None:
-            raise NotImplementedError(
-                "rigid_motion: a graph holds none with min_distance or radius; detect outside the graph"
-            )
+            raise NotImplementedError(f"rigid_motion: a graph holds none with min_distance or radius; {outside}")
         at_once = self.at_once
         if at_once is None or at_once.bounds.motion is not arcs:
             if (np.linalg.norm(arcs.turn, axis=1) > LARGEST_TURN).any():
                 raise NotImplementedError(
-                    "rigid_motion: a graph holds turns of at most a quarter of a turn; detect outside the graph"
+                    f"rigid_motion: a graph holds turns of at most a quarter of a turn; {outside}"
                 )
             raise RuntimeError("detect with this rigid_motion once before capturing, which copies them to the device")
         if x0.requires_grad or x1.requires_grad:

@@ -109,9 +109,8 @@ class ArcSearch:
         pipeline, timer = self._pipeline, self._timer
         pipeline.add_to_radius(self._deviation(level))
         start, end = (self._bounds.place((part + i) * 2.0**-level) for i in range(2))
-        retry_until_fits(
-            lambda: pipeline.find_contacts(start, end, changed=changed, timer=timer), pipeline, self._mesh.device
-        )
+        find = functools.partial(pipeline.find_contacts, start, end, changed=changed, timer=timer)
+        retry_until_fits(find, pipeline, self._mesh.device)
         # what floating point has left to exact arithmetic stays as it is
         pairs = {kind.label: counts._replace(for_exact=0) for kind, counts in pipeline.counts.pairs.items()}
         counts = dataclasses.replace(pipeline.counts, **pairs)

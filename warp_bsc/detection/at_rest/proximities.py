@@ -172,10 +172,8 @@ class ProximityFinder:
         self._counters = Counters(mesh.device)
         self._broad_phase = make_broad_phase(mesh, self._counters.face_pairs)
         self._lock = self._broad_phase.lock
-        elements = len(mesh.faces) + len(mesh.free_edges) + len(mesh.points)
-        self._queues = [
-            _ProximityQueue(kind, getattr(self._counters, kind.label), 2 * elements, mesh.device) for kind in PairKind
-        ]
+        room = 2 * (len(mesh.faces) + len(mesh.free_edges) + len(mesh.points)), mesh.device
+        self._queues = [_ProximityQueue(kind, getattr(self._counters, kind.label), *room) for kind in PairKind]
         self._rings = make_rings(mesh, rings)
 
     @one_at_a_time
