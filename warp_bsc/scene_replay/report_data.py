@@ -190,9 +190,8 @@ def report_data(summary: Summary, baseline: Baseline | None) -> dict:
         "validation": None,
     }
     if not summary.is_complete:
-        data["partial"] = (
-            f"Partial: {len(summary.intervals)} of {summary.interval_count} intervals were checked; {summary.stopped}."
-        )
+        checked = f"{len(summary.intervals)} of {summary.interval_count} intervals were checked"
+        data["partial"] = f"Partial: {checked}; {summary.stopped}."
     if not data["nothing"]:
         data["partial"] = " ".join(filter(None, (data["partial"], summary.not_checked)))
     if found := summary.validation:
