@@ -185,9 +185,8 @@ class CollisionDetector:
         self._finder.check_counted_finite(x0, x1)
         found = {kind.label: np.zeros((0, 2), dtype=np.int32) for kind in PairKind}
         for phase in pipeline.narrow_phases:
-            kind = phase.kind
-            pairs = phase.queue.numpy()[: pipeline.counts.pairs[kind].queued]
-            found[kind.label] = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
+            pairs = phase.queue.numpy()[: pipeline.counts.pairs[phase.kind].queued]
+            found[phase.kind.label] = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
         return Candidates(**found)
 
     @one_at_a_time

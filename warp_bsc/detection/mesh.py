@@ -127,13 +127,12 @@ class CollisionMesh:
         self.vertex_count = checked_integer(vertex_count, "vertex_count")
         self.only_free = checked_flag(only_free, "only_free")
         self.device = checked_device(device)
-        faces = self._checked_indices(faces, 3, "face")
+        self.faces = self._checked_indices(faces, 3, "face")
         given_edges = self._checked_indices(() if edges is None else edges, 2, "edge")
         same = np.flatnonzero(given_edges[:, 0] == given_edges[:, 1])
         if len(same):
             raise ValueError(f"edges[{same[0]}] has vertex {given_edges[same[0], 0]} twice")
         given_points = self._checked_indices(() if points is None else points, 1, "point")
-        self.faces = faces
         self.tets = self._checked_indices(() if tets is None else tets, 4, "tet")
         sides = np.sort(self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
         rows = np.concatenate([sides, np.sort(given_edges, axis=1)]).astype(np.int64)
@@ -179,9 +178,8 @@ class CollisionMesh:
         """The groups and masks on the device."""
         pair_filter = PairFilter()
         if self.group is not None and self.mask is not None:
-            group, mask = self.group.view(np.int32), self.mask.view(np.int32)
-            pair_filter.group = wp.array(group, dtype=int, device=self.device)
-            pair_filter.mask = wp.array(mask, dtype=int, device=self.device)
+            arrays = (wp.array(bits.view(np.int32), dtype=int, device=self.device) for bits in (self.group, self.mask))
+            pair_filter.group, pair_filter.mask = arrays
         return pair_filter
 
     @functools.cached_property
@@ -319,7 +317,8 @@ class CollisionMesh:
     def _checked_world(self, world: ArrayLike | wp.array) -> np.ndarray:
         """Returns the world of each vertex, int32, shape [vertex_count], one for the vertices of a face or an edge."""
         worlds = as_numpy(world, "world")
-        if worlds.shape != ((count := self.vertex_count),) or not np.issubdtype(worlds.dtype, np.integer):
+        count = self.vertex_count
+        if worlds.shape != (count,) or not np.issubdtype(worlds.dtype, np.integer):
             raise ValueError(f"world must be {count} integers, one a vertex, got {worlds.dtype} {worlds.shape}")
         bad = (worlds < 0) | (worlds >= 2**31)
         if bad.any():

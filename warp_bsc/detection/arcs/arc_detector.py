@@ -10,7 +10,7 @@ from ..results.collision_finder import CollisionFinder
 from ..results.collisions import CapturedCollisions, Collisions
 from ..run.phase_timer import PhaseTimer
 from ..run.settings import add_counts
-from .arc_pipeline import LARGEST_TURN, ArcPipeline
+from .arc_pipeline import ArcPipeline
 from .arc_search import ArcSearch, join_contacts
 from .rigid_motion import ArcBounds, RigidMotion
 
@@ -44,7 +44,7 @@ class ArcDetector:
             raise ValueError("rigid_motion: x0 and x1 must not require gradients")
         mesh, method, body = self._straight.mesh, self._straight.method, arcs.body
         bounds = ArcBounds(arcs, mesh.device_vertices, x0, x1)
-        if self._straight.radius is None and ArcPipeline.is_for(bounds):
+        if self._straight.radius is None and ArcPipeline.is_for(arcs):
             at_once = self.at_once
             if at_once is None or not np.array_equal(at_once.body, body):
                 at_once = self.at_once = ArcPipeline(self._straight, bounds)
@@ -80,15 +80,13 @@ class ArcDetector:
 
         Arguments are those of the last call of :meth:`find`, errors those of :meth:`.CollisionDetector.capture`.
         """
-        outside = "detect outside the graph"
+        refusal = "rigid_motion: a graph holds {}; detect outside the graph"
         if self._straight.radius is not None:
-            raise NotImplementedError(f"rigid_motion: a graph holds none with min_distance or radius; {outside}")
+            raise NotImplementedError(refusal.format("none with min_distance or radius"))
         at_once = self.at_once
         if at_once is None or at_once.bounds.motion is not arcs:
-            if (np.linalg.norm(arcs.turn, axis=1) > LARGEST_TURN).any():
-                raise NotImplementedError(
-                    f"rigid_motion: a graph holds turns of at most a quarter of a turn; {outside}"
-                )
+            if not ArcPipeline.is_for(arcs):
+                raise NotImplementedError(refusal.format("turns of at most a quarter of a turn"))
             raise RuntimeError("detect with this rigid_motion once before capturing, which copies them to the device")
         if x0.requires_grad or x1.requires_grad:
             raise ValueError("rigid_motion: x0 and x1 must not require gradients")

@@ -41,15 +41,9 @@ class ArcSearch:
         """
         self.body = body
         self._mesh = mesh = straight.mesh
-        self._pipeline = DetectionPipeline(
-            mesh,
-            method="float" if straight.method == "float" else "conservative",
-            tolerance=straight.tolerance,
-            min_distance=min_distance,
-            rings=rings,
-            body=body,
-            only_used_vertices=True,
-        )
+        options = {"method": "float" if straight.method == "float" else "conservative", "tolerance": straight.tolerance}
+        options |= {"min_distance": min_distance, "rings": rings, "only_used_vertices": True}
+        self._pipeline = DetectionPipeline(mesh, body=body, **options)
         self._elements = {n.kind: mesh.elements(n.kind) for n in self._pipeline.narrow_phases}
 
     def find(

@@ -113,8 +113,7 @@ def _decided(
     for limbs in BITS:
         if not (status[:count].numpy() == UNSURE).any():
             break
-        inputs = [x, edges, mesh.device_faces, across, pairs]
-        kernel = _decide_exactly(x.dtype, limbs)
+        kernel, inputs = _decide_exactly(x.dtype, limbs), [x, edges, mesh.device_faces, across, pairs]
         launch_over(kernel, count, inputs=inputs, outputs=[status], device=mesh.device, block_dim=64)
     return status[:count].numpy()
 
@@ -242,8 +241,9 @@ class IntersectionFinder:
         def launch() -> None:
             self._counters.array.zero_()
             enqueue(x)
-            queue, inputs = (self._pairs, self._counts, Count.QUEUED), [x, mesh.device_edges, mesh.device_faces]
-            inputs, outputs = [*inputs, self._pairs], [self._counts, self._kept, self._status]
+            inputs = [x, mesh.device_edges, mesh.device_faces, self._pairs]
+            outputs = [self._counts, self._kept, self._status]
+            queue = self._pairs, self._counts, Count.QUEUED
             launch_over_queue(_keep_crossings(x.dtype), *queue, inputs=inputs, outputs=outputs)
 
         retry_until_fits(launch, self, mesh.device)
@@ -267,14 +267,13 @@ class IntersectionFinder:
         counts = self._counters.read()
         queued, found = counts.edge_edge.queued, counts.edge_edge.found
         self._count, self._filtered = found, counts.edge_edge.filtered
-        grows = counts.face_pairs > self._broad_phase.capacity or queued > len(self._pairs)
+        grows = counts.face_pairs > self._broad_phase.capacity or queued > len(self._pairs) or found > len(self._kept)
         self._broad_phase.grow(counts.face_pairs)
         if queued > len(self._pairs):
             capacity = capacity_for(queued, "edge-face pairs")
             self._pairs = wp.empty(capacity, dtype=wp.vec2i, device=self._pairs.device)
         if found > len(self._kept):
             self._allocate(capacity_for(found, "intersections"))
-            return True
         return grows
 
     def _allocate(self, capacity: int) -> None:

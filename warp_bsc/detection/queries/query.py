@@ -194,7 +194,6 @@ def _query(kind, points, min_distance, method, timed, tolerance, device, out=Non
     counts = wp.zeros(len(Count), dtype=wp.int64, device=device)
     narrow_phase = NarrowPhase(kind, counts, n, pairs[-1] + 1 if n else (1, 1))
     narrow_phase.queue.assign(pairs)
-    all_queued = PairCounts(queued=n)
     # without a distance: the narrow phase of contacts
     contact = kind in SURFACE_KINDS and not distance.any()
     radius = np.zeros((n, half))  # 0 of all vertices but those of the first element, so that the sum of two is exact
@@ -208,7 +207,7 @@ def _query(kind, points, min_distance, method, timed, tolerance, device, out=Non
         buffers = "exact" if method == "conservative" and timed else method
 
         def launch() -> None:
-            counts.assign(all_queued)
+            counts.assign(PairCounts(queued=n))
             options = {"method": buffers, "timed": timed, "tolerance": tolerance, "timer": PhaseTimer(None)}
             if contact:
                 run_contacts([(narrow_phase, elements)], x0, x1, **options)
@@ -227,20 +226,16 @@ def _query(kind, points, min_distance, method, timed, tolerance, device, out=Non
             decide_on_host(kind, x0, x1, elements, None if contact else radius, contacts, left, timed=timed)
         return contacts, contacts.pairs[:, 0] // (2 if kind == PairKind.EDGE_EDGE else half)
 
-    certified, certified_rows = solve("conservative" if method == "float" else method)
+    found, rows = solve("conservative" if method == "float" else method)
     status = np.zeros(n, dtype=np.int8)
-    status[certified_rows] = certified.status
-    decided, decided_rows = solve("float") if method == "float" else (certified, certified_rows)
-    found = decided.hit
-    decided_rows = decided_rows[found]
+    status[rows] = found.status
+    if method == "float":
+        found, rows = solve("float")
+    found, rows = found.rows(found.hit), rows[found.hit]
     hit = np.zeros(n, dtype=bool)
-    hit[decided_rows] = True
+    hit[rows] = True
     if not timed:
         return QueryResult(hit, status, None, None, None)
-    toi = np.full(n, 2.0)
-    coordinates = np.full((n, 3), np.nan)
-    normal = np.full((n, 3), np.nan)
-    toi[decided_rows] = decided.toi[found]
-    coordinates[decided_rows] = decided.coordinates[found]
-    normal[decided_rows] = decided.normal[found]
+    toi, coordinates, normal = np.full(n, 2.0), np.full((n, 3), np.nan), np.full((n, 3), np.nan)
+    toi[rows], coordinates[rows], normal[rows] = found.toi, found.coordinates, found.normal
     return QueryResult(hit, status, toi, coordinates, normal)
