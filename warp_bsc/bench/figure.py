@@ -14,6 +14,7 @@ _METHODS = {
 }
 _IPC_METHODS = {"additive": ("Additive CCD", "#b2abd2"), "tight inclusion": ("Tight Inclusion", "#7b6ca8")}
 _WIDTH = 0.84
+_ABOVE_BAR = {"textcoords": "offset points", "ha": "center", "va": "bottom", "rotation": 90, "fontsize": 7}
 
 
 def draw_paper_benchmarks(benchmarks: list[dict[str, Any]], path: str | os.PathLike) -> None:
@@ -71,16 +72,7 @@ def _draw_panel(axes, place, scenes):
         for at, took in zip(x, times, strict=True):
             if np.isfinite(took) and took > 0.0:
                 text = f"{took:,.0f}" if took >= 10.0 else f"{took:.2g}"
-                axes.annotate(
-                    text,
-                    (at, took),
-                    (0, 2),
-                    textcoords="offset points",
-                    ha="center",
-                    va="bottom",
-                    rotation=90,
-                    fontsize=7,
-                )
+                axes.annotate(text, (at, took), (0, 2), **_ABOVE_BAR)
     axes.set(yscale="log", ylabel="time a query [ns]")
     axes.set_xticks(range(len(scenes)), scenes.keys())
     times = [took for bars in scenes.values() for took in bars.values() if took > 0.0]

@@ -135,9 +135,8 @@ def _find_commit() -> tuple[str | None, bool | None]:
 
     with contextlib.suppress(OSError, subprocess.CalledProcessError):
         if Path(git("rev-parse", "--show-toplevel")).resolve() == _ROOT:  # not a checkout of something else around it
-            return git("rev-parse", "HEAD"), bool(
-                git("status", "--porcelain", "--untracked-files=no", "--", ".", _NO_CAUSE)
-            )
+            status = git("status", "--porcelain", "--untracked-files=no", "--", ".", _NO_CAUSE)
+            return git("rev-parse", "HEAD"), bool(status)
     named = os.environ.get(COMMIT)
     return (named, False) if named else (None, None)
 

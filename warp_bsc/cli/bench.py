@@ -55,13 +55,9 @@ class _Benchmark:
 
 def add_to(commands: Commands, summary: str, named: list[str] | None = None) -> None:
     """Adds ``bench``, and its benchmarks: with options those that are named, or all; the others without."""
-    lines = [
-        "bench",
-        "bench --quick",
-        "bench paper --help",
-        *(f"bench {name}" for name in BENCHMARKS if name != "paper"),
-    ]
-    examples = "\n".join(f"  warp-bsc {line}" for line in [*lines, "bench detector --help"])
+    others = [name for name in BENCHMARKS if name != "paper"]
+    lines = ["", " --quick", " paper --help", *(f" {name}" for name in others), " detector --help"]
+    examples = "\n".join(f"  warp-bsc bench{line}" for line in lines)
     epilog = f"examples:\n{examples}\n\n{explain_statuses()}"
     bench = add_command(commands, "bench", None, summary=summary, description=_DESCRIPTION, epilog=epilog)
     benchmarks = bench.add_subparsers(required=True, metavar="BENCHMARK")

@@ -23,15 +23,9 @@ class RunProgress:
         """Prepares the bar; ``as_json`` writes an object of JSON in a line each time instead, for programs."""
         self._activity, self._as_json = activity, as_json
         self.console = Console(stderr=True)
-        self._bar = Progress(
-            TextColumn(activity),
-            BarColumn(bar_width=None),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[note]}"),
-            TimeRemainingColumn(),
-            console=self.console,
-            transient=True,
-        )
+        bar, note = (BarColumn(bar_width=None), MofNCompleteColumn()), TextColumn("{task.fields[note]}")
+        columns = TextColumn(activity), *bar, note, TimeRemainingColumn()
+        self._bar = Progress(*columns, console=self.console, transient=True)
         self._bar.disable = as_json or not self.console.is_terminal
         self._task = self._bar.add_task("", total=None, note="")
         self._started = self._last_line = time.monotonic()

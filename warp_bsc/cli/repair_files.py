@@ -81,17 +81,11 @@ def repair_files(frames: Frames, arguments: argparse.Namespace, selection: Selec
         for output in filter(None, outputs):
             files.append(OutputFile(output))  # fails before anything is repaired
             stack.callback(files[-1].discard)
+        of_vertices = {"fixed": kept[scene.file_of], "rigid": np.where(are_rigid[scene.file_of], pieces, -1)}
+        of_vertices["order"] = scene.file_of if arguments.order else None
+        limits = {name: getattr(arguments, name) for name in ("min_distance", "max_strain")}
         with loading_kernels(device):
-            result = repair(
-                mesh,
-                scene.x,
-                fixed=kept[scene.file_of],
-                rigid=np.where(are_rigid[scene.file_of], pieces, -1),
-                order=scene.file_of if arguments.order else None,
-                x_previous=previous.x if previous else None,
-                min_distance=arguments.min_distance,
-                max_strain=arguments.max_strain,
-            )
+            result = repair(mesh, scene.x, **of_vertices, x_previous=previous.x if previous else None, **limits)
         xs = scene.of_files(np.asarray(result.x))
         contents = map(MeshFile.with_positions, scene.files, xs)
         for file, data in zip(files, itertools.compress(contents, ~kept), strict=True):
@@ -179,15 +173,9 @@ def _write_page(
     recorder.add(ShotFrame(given, x, x - given, result.certified), moved)
     stretches = [recorder.finish([contour.reason for contour in result.unresolved])]
     with naming(page.name):
-        write_page(
-            page,
-            before,
-            stretches=lambda: stretches,
-            before=find(before, "Finding", arguments, device, ()),
-            after=find(after, "Checking", arguments, device, ()),
-            kept=kept,
-            min_distance=arguments.min_distance,
-        )
+        found = [find(before, "Finding", arguments, device, ()), find(after, "Checking", arguments, device, ())]
+        options = {"kept": kept, "min_distance": arguments.min_distance}
+        write_page(page, before, stretches=lambda: stretches, before=found[0], after=found[1], **options)
 
 
 def in_words(elements: list[dict[str, Any]]) -> str:

@@ -147,17 +147,10 @@ class RepairRun:
         started = time.perf_counter()
         with RunProgress("Repairing") as progress, loading_kernels(self._device, progress.console):
             progress.show(done, len(scene))
-            for stretch in repair_shot(
-                scene,
-                journal.findings,
-                keep=arguments.keep,
-                rigid=arguments.rigid,
-                max_move=arguments.max_move,
-                min_distance=arguments.min_distance,
-                device=self._device,
-                start=done,
-                progress=lambda number: progress.show(number, len(scene)),
-            ):
+            options = {name: getattr(arguments, name) for name in ("keep", "rigid", "max_move", "min_distance")}
+            options |= {"device": self._device, "start": done}
+            show = functools.partial(progress.show, total=len(scene))
+            for stretch in repair_shot(scene, journal.findings, **options, progress=show):
                 scene.files.check()
                 if journal.is_open:
                     self._keep(functools.partial(journal.add, stretch))
@@ -202,17 +195,10 @@ class RepairRun:
         try:
             if self.stretches and not self.journal.is_open:
                 raise OSError(f"it needs {self.journal.path}, which could not be written")
+            stretches = functools.partial(self.journal.stretches, self.scene)
+            found = {"before": self.journal.findings, "after": after, "min_distance": self._arguments.min_distance}
             with naming(page.name):
-                write_page(
-                    page,
-                    self.scene,
-                    stretches=lambda: self.journal.stretches(self.scene),
-                    before=self.journal.findings,
-                    after=after,
-                    kept=kept,
-                    min_distance=self._arguments.min_distance,
-                    stopped=self._stopped,
-                )
+                write_page(page, self.scene, stretches=stretches, **found, kept=kept, stopped=self._stopped)
             self.page = page.path
         except Exception as error:
             self.problems.append(f"{page.name}: not written: {describe(error)}")

@@ -23,11 +23,8 @@ _STRETCHES = (  # of a stretch and its frames
 def print_repair(console: Console, run: RepairRun, kept: dict[str, str], remaining: dict[str, int]) -> None:
     """Prints what was done, and what remains."""
     scene = run.scene
-    say(
-        console,
-        f"{scene.path}: {count(len(scene.names), 'mesh', 'meshes')}, {scene.vertex_count:,} vertices, "
-        f"{count(len(scene), 'interval')}",
-    )
+    size = f"{count(len(scene.names), 'mesh', 'meshes')}, {scene.vertex_count:,} vertices"
+    say(console, f"{scene.path}: {size}, {count(len(scene), 'interval')}")
     for warning in scene.warnings:
         say(console, f"note: {with_option(warning)}")
     for note in run.notes:
@@ -48,12 +45,10 @@ def print_repair(console: Console, run: RepairRun, kept: dict[str, str], remaini
         _print_stretches(console, run)
     if run.distorted:
         worst, (low, high) = max(run.distorted.items(), key=lambda frame: distortion(frame[1]))
-        say(
-            console,
-            f"Not good: {count(len(run.distorted), 'frame')}, with edges shorter than a third of the shot's or longer "
-            f"than twice; at {worst:g} the worst, {low:.2f} to {high:.2f}.",
-            style="bold red",
+        frames = (
+            f"{count(len(run.distorted), 'frame')}, with edges shorter than a third of the shot's or longer than twice"
         )
+        say(console, f"Not good: {frames}; at {worst:g} the worst, {low:.2f} to {high:.2f}.", style="bold red")
     for stretch in run.stretches[:LONGEST]:
         for reason in stretch.reasons:
             say(console, f"Not repaired from {stretch.start:g} to {stretch.end:g}: {reason}.")
@@ -62,12 +57,8 @@ def print_repair(console: Console, run: RepairRun, kept: dict[str, str], remaini
             say(console, f"Not certified: {count(len(stretch.uncertified), 'frame')}, the first at {times}.")
     for what, number in run.found.items():
         say(console, f"{what.capitalize()}: {number:,} before, {remaining[what]:,} remain.")
-    seconds = run.seconds
-    say(
-        console,
-        f"Finding took {1e3 * seconds['finding'] / len(scene):,.1f} ms an interval, repairing "
-        f"{1e3 * seconds['repairing'] / len(scene):,.1f} ms.",
-    )
+    finding, repairing = (f"{1e3 * run.seconds[name] / len(scene):,.1f} ms" for name in ("finding", "repairing"))
+    say(console, f"Finding took {finding} an interval, repairing {repairing}.")
     if not run.has_moved:
         say(console, "Nothing was moved: what is written shows the scene as it is.")
     say(console, f"Wrote {run.output}.")

@@ -32,21 +32,14 @@ _RANGES = 4
 def print_replay(console: Console, summary: Summary) -> None:
     """Prints whether the scene is broken, by which pairs of meshes, the sums, and a table of the worst intervals."""
     scene, intervals = summary.scene, summary.intervals
-    say(
-        console,
-        f"{scene.path}: {count(len(scene.names), 'mesh', 'meshes')}, {scene.vertex_count:,} vertices, "
-        f"{scene.face_count:,} faces, {count(summary.interval_count, 'interval')}; method {summary.method} on "
-        f"{summary.device}",
-    )
+    size = f"{count(len(scene.names), 'mesh', 'meshes')}, {scene.vertex_count:,} vertices, {scene.face_count:,} faces"
+    all_intervals = count(summary.interval_count, "interval")
+    say(console, f"{scene.path}: {size}, {all_intervals}; method {summary.method} on {summary.device}")
     for warning in scene.warnings:
         say(console, f"note: {with_option(warning)}")
     say(console, f"note: {summary.motion}")
     if not summary.is_complete:
-        say(
-            console,
-            f"Partial: {len(intervals)} of {count(summary.interval_count, 'interval')} were checked; "
-            f"{summary.stopped}.",
-        )
+        say(console, f"Partial: {len(intervals)} of {all_intervals} were checked; {summary.stopped}.")
 
     if sentence := verdict(summary):
         say(console, sentence, style="bold red" if sentence.startswith("Broken") else "bold")
@@ -111,12 +104,9 @@ def print_work(console: Console, works: list[Work | None], writing: float) -> No
     times["writing"] = writing
     total = max(sum(times.values()), 1e-9)
     shares = ", ".join(f"{name} {seconds:,.2f} s ({seconds / total:.0%})" for name, seconds in times.items())
-    longest = max(work.reading + work.checking for work in done)
-    say(
-        console,
-        f"Work: {shares}. Reading and checking took {1e3 * (total - writing) / len(done):,.1f} ms an interval, at most "
-        f"{1e3 * longest:,.1f} ms.",
-    )
+    each, longest = (total - writing) / len(done), max(work.reading + work.checking for work in done)
+    took = f"{1e3 * each:,.1f} ms an interval, at most {1e3 * longest:,.1f} ms"
+    say(console, f"Work: {shares}. Reading and checking took {took}.")
     by_worker = defaultdict(list)
     for work in done:
         by_worker[work.worker and f"{work.worker} on {work.device}"].append(work.reading + work.checking)
@@ -150,22 +140,15 @@ def _new_finding(what: str, meshes: tuple[str, ...], start: float, end: float) -
 
 def _print_certificate(console: Console, summary: Summary) -> None:
     """Prints whether a collision may be missing."""
-    intervals = summary.intervals
+    intervals, of_all = summary.intervals, count(len(summary.intervals), "interval")
     if uncertain := sum(not interval.certified for interval in intervals):
-        say(
-            console,
-            f"Not certified even for {CERTIFIED_FOR}, collisions may be missing: {uncertain} of "
-            f"{count(len(intervals), 'interval')}.",
-        )
-    elif summary.method == "conservative":
-        unsure = sum(interval.unsure for interval in intervals)
-        say(
-            console,
-            f"Certified for {CERTIFIED_FOR}: no collision is missing. Pairs tested that floating point could not "
-            f"certify: {unsure:,}.",
-        )
-    else:
-        say(console, f"Certified for {CERTIFIED_FOR}: every pair tested.")
+        say(console, f"Not certified even for {CERTIFIED_FOR}, collisions may be missing: {uncertain} of {of_all}.")
+        return
+    certified = "every pair tested."
+    if summary.method == "conservative":
+        certified = "no collision is missing. Pairs tested that floating point could not certify: "
+        certified += f"{sum(interval.unsure for interval in intervals):,}."
+    say(console, f"Certified for {CERTIFIED_FOR}: {certified}")
 
 
 def _print_pairs(console: Console, scene: Scene, pairs: list[PairFindings]) -> None:
@@ -201,11 +184,8 @@ def _print_collisions(console: Console, summary: Summary) -> None:
     kinds = ["vertex_face", "edge_edge"] + ["vertex_edge", "vertex_vertex"] * summary.scene.has_strands
     numbers = [sum(getattr(interval, f"{kind}_hits") for interval in colliding) for kind in kinds]
     texts = [f"{number:,} {kind.replace('_', '-')}" for number, kind in zip(numbers, kinds, strict=True)]
-    say(
-        console,
-        f"Collisions in {len(colliding)} of {count(len(summary.intervals), 'interval')}: "
-        f"{', '.join(texts[:-1])} and {texts[-1]} pairs.",
-    )
+    where = f"{len(colliding)} of {count(len(summary.intervals), 'interval')}"
+    say(console, f"Collisions in {where}: {', '.join(texts[:-1])} and {texts[-1]} pairs.")
     contact = colliding[0].earliest
     assert contact  # it collides
     say(console, f"The first at time {contact.time:.6g}: {_contact(contact)}.")
@@ -230,24 +210,16 @@ def _print_intersections(console: Console, summary: Summary, initial: set[tuple[
         state = "Already crosses" if first.crossings else "Already touches" if first.touches else "Already inside"
         say(console, f"{state} at {first.time:g}: {_intersecting(first)}.")
     worst = max(samples, key=lambda sample: (sample.crossings, sum(sample.inside.values()), sample.touches))
-    intersecting = sum(not sample.is_empty for sample in samples)
-    say(
-        console,
-        f"Intersections at rest at {intersecting:,} of {times}; the most at {worst.time:g}: {_intersecting(worst)}.",
-    )
+    where = f"{sum(not sample.is_empty for sample in samples):,} of {times}"
+    say(console, f"Intersections at rest at {where}; the most at {worst.time:g}: {_intersecting(worst)}.")
     pairs = [" inside ".join(span.meshes) if span.inside else _pair(span.meshes) for span in spans]
     lines = [f"{pair}: {_history(span)}" for pair, span in zip(pairs, spans, strict=True)]
     say_list(console, lines, "; --json has all.")
     if summary.colliding:
-        phases = [
-            sum(column) for column in zip(*(interval.phases or () for interval in summary.colliding), strict=True)
-        ]
-        separate = sum(interval.separate_hits or 0 for interval in summary.colliding)
-        say(
-            console,
-            f"Of the collisions, {separate:,} are of meshes that were separate before. The surfaces around them: "
-            f"{', '.join(f'{phase} {number:,}' for phase, number in zip(PHASES, phases, strict=True))}.",
-        )
+        numbers = map(sum, zip(*(interval.phases or () for interval in summary.colliding), strict=True))
+        phases = ", ".join(f"{phase} {number:,}" for phase, number in zip(PHASES, numbers, strict=True))
+        separate = f"{sum(interval.separate_hits or 0 for interval in summary.colliding):,} are of meshes"
+        say(console, f"Of the collisions, {separate} that were separate before. The surfaces around them: {phases}.")
 
 
 def _print_proximities(console: Console, summary: Summary, clearance: float) -> None:
@@ -261,11 +233,9 @@ def _print_proximities(console: Console, summary: Summary, clearance: float) -> 
         return
     near = sum(bool(sample.pairs) for sample in samples)
     worst = max(samples, key=lambda sample: sample.pairs)
-    say(
-        console,
-        f"Elements are at most {clearance:g} apart at {near:,} of {times}. The smallest distance is "
-        f"{nearest[0].distance:.6g}, at {nearest[0].time:g}; the most pairs at {worst.time:g}: {worst.pairs:,}.",
-    )
+    least = f"{nearest[0].distance:.6g}, at {nearest[0].time:g}; the most pairs at {worst.time:g}: {worst.pairs:,}"
+    apart = f"Elements are at most {clearance:g} apart at {near:,} of {times}"
+    say(console, f"{apart}. The smallest distance is {least}.")
     rows = [(_contact(found), found) for found in nearest[:LONGEST]]
     print_table(console, "Nearest elements", _NEAREST, rows, caption="The nearest of all times.")
     if len(nearest) > LONGEST:
@@ -308,11 +278,8 @@ def _history(span: IntersectionSpan) -> str:
 def _print_validation(console: Console, found: Validation, has_strands: bool) -> None:
     """Prints the comparison with the exact checker."""
     wrong = found.disagreements
-    say(
-        console,
-        f"Validated by the exact checker: {count(found.hits, 'collision')} and "
-        f"{count(found.others, 'other pair')}, {count(len(wrong), 'disagreement')}.",
-    )
+    pairs = f"{count(found.hits, 'collision')} and {count(found.others, 'other pair')}"
+    say(console, f"Validated by the exact checker: {pairs}, {count(len(wrong), 'disagreement')}.")
     if has_strands:
         say(console, "Collisions of curves and points are not validated.")
     say_list(console, wrong, "; --json has all.")

@@ -165,7 +165,8 @@ class CollisionDetector:
             end.assign(x)
             found = self._finder.find(start, end, keep_separated=True, queued=queued)
             if not found or step == 0.0:
-                return FreeStep(step, _like(x, x1), found.free)
+                reached = wp.array(x, dtype=end.dtype, device=x1.device) if isinstance(x1, wp.array) else x
+                return FreeStep(step, reached, found.free)
             step *= found.earliest_toi * (1.0 - retreat)
             queued, retreat = True, 2.0 * retreat
 
@@ -184,9 +185,8 @@ class CollisionDetector:
         self._finder.check_counted_finite(x0, x1)
         found = {kind.label: np.zeros((0, 2), dtype=np.int32) for kind in PairKind}
         for phase in pipeline.narrow_phases:
-            kind = phase.kind
-            pairs = phase.queue.numpy()[: pipeline.counts.pairs[kind].queued]
-            found[kind.label] = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
+            pairs = phase.queue.numpy()[: pipeline.counts.pairs[phase.kind].queued]
+            found[phase.kind.label] = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
         return Candidates(**found)
 
     @one_at_a_time
@@ -324,19 +324,15 @@ class CollisionDetector:
         if arcs is None:
             return None
         check_instance(arcs, "rigid_motion", RigidMotion, "a RigidMotion")
-        if len(arcs.body) != self.mesh.vertex_count:
-            raise ValueError(
-                f"rigid_motion must have a body for {self.mesh.vertex_count} vertices, not {len(arcs.body)}"
-            )
+        if len(arcs.body) != (count := self.mesh.vertex_count):
+            raise ValueError(f"rigid_motion must have a body for {count} vertices, not {len(arcs.body)}")
         return arcs if (arcs.body >= 0).any() else None
 
     def _checked_vertices(self, vertices: ArrayLike) -> wp.array:
         """Returns which vertices are given, on the device, array of int."""
-        mask = as_numpy(vertices, "vertices", "an array of bool")
-        if mask.dtype != bool or mask.shape != (self.mesh.vertex_count,):
-            raise ValueError(
-                f"vertices must be bool of shape ({self.mesh.vertex_count},), not {mask.dtype} {mask.shape}"
-            )
+        mask, shape = as_numpy(vertices, "vertices", "an array of bool"), (self.mesh.vertex_count,)
+        if mask.dtype != bool or mask.shape != shape:
+            raise ValueError(f"vertices must be bool of shape {shape}, not {mask.dtype} {mask.shape}")
         return wp.array(mask, dtype=int, device=self.mesh.device)
 
     def _checked_positions(self, x0: ArrayLike | wp.array, x1: ArrayLike | wp.array) -> tuple[wp.array, wp.array]:
@@ -344,10 +340,8 @@ class CollisionDetector:
         x0 = self.mesh.device_positions(x0, "x0")
         x1 = self.mesh.device_positions(x1, "x1")
         if x0.dtype != x1.dtype:
-            x0_type, x1_type = ("float32" if x.dtype == wp.vec3 else "float64" for x in (x0, x1))
-            raise ValueError(
-                f"x1 must be {x0_type} as x0, not {x1_type}: convert one of them, exactly if it becomes float64"
-            )
+            one, other = ("float32" if x.dtype == wp.vec3 else "float64" for x in (x0, x1))
+            raise ValueError(f"x1 must be {one} as x0, not {other}: convert one of them, exactly if it becomes float64")
         return x0, x1
 
     def _capture_on_cpu(self, x0: wp.array, x1: wp.array, arcs: RigidMotion | None) -> CapturedCollisions:
@@ -373,13 +367,6 @@ def _partway(x0: np.ndarray, x1: np.ndarray, share: float, last: np.ndarray) -> 
     with np.errstate(invalid="ignore", over="ignore"):  # of vertices that are not used
         x = ((1.0 - share) * x0.astype(np.float64) + share * x1.astype(np.float64)).astype(x0.dtype)
     return np.clip(x, np.minimum(x0, last), np.maximum(x0, last))
-
-
-def _like(x: np.ndarray, given: ArrayLike | wp.array) -> np.ndarray | wp.array:
-    """Returns positions as a Warp array of vectors where others were given as a Warp array, on its device."""
-    if not isinstance(given, wp.array):
-        return x
-    return wp.array(x, dtype=wp.vec3 if x.dtype == np.float32 else wp.vec3d, device=given.device)
 
 
 def stats_by_world(detector: CollisionDetector, collisions: Collisions) -> list[DetectionStats] | None:

@@ -140,8 +140,7 @@ def _decided(mesh: CollisionMesh, x0: wp.array, x1: wp.array, status: wp.array) 
     for limbs in BITS:
         if not (status.numpy() == UNSURE).any():
             break
-        kernel = _decide_exactly(x0.dtype, limbs)
-        inputs = [x0, x1, tets]
+        kernel, inputs = _decide_exactly(x0.dtype, limbs), [x0, x1, tets]
         launch_over(kernel, len(mesh.tets), inputs=inputs, outputs=[status], device=mesh.device, block_dim=64)
     decided = status.numpy()
     (left,) = np.nonzero(decided == UNSURE)

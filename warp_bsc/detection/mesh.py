@@ -127,20 +127,17 @@ class CollisionMesh:
         self.vertex_count = checked_integer(vertex_count, "vertex_count")
         self.only_free = checked_flag(only_free, "only_free")
         self.device = checked_device(device)
-        faces = self._checked_indices(faces, 3, "face")
+        self.faces = self._checked_indices(faces, 3, "face")
         given_edges = self._checked_indices(() if edges is None else edges, 2, "edge")
         same = np.flatnonzero(given_edges[:, 0] == given_edges[:, 1])
         if len(same):
             raise ValueError(f"edges[{same[0]}] has vertex {given_edges[same[0], 0]} twice")
         given_points = self._checked_indices(() if points is None else points, 1, "point")
-        self.faces = faces
         self.tets = self._checked_indices(() if tets is None else tets, 4, "tet")
         sides = np.sort(self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
         rows = np.concatenate([sides, np.sort(given_edges, axis=1)]).astype(np.int64)
-        # as one number for each pair of vertices: NumPy sorts rows much more slowly
-        keys, first_sides, edge_of_side = np.unique(
-            rows @ np.array([self.vertex_count, 1]), return_index=True, return_inverse=True
-        )
+        numbers = rows @ np.array([self.vertex_count, 1])  # one for each pair: NumPy sorts rows much more slowly
+        keys, first_sides, edge_of_side = np.unique(numbers, return_index=True, return_inverse=True)
         all_edges = np.stack(np.divmod(keys, max(1, self.vertex_count)), axis=1).astype(np.int32)
         # a face that names a vertex twice has an edge without length: its point belongs to the other edge
         proper = all_edges[:, 0] != all_edges[:, 1]
@@ -181,9 +178,8 @@ class CollisionMesh:
         """The groups and masks on the device."""
         pair_filter = PairFilter()
         if self.group is not None and self.mask is not None:
-            group, mask = self.group.view(np.int32), self.mask.view(np.int32)
-            pair_filter.group = wp.array(group, dtype=int, device=self.device)
-            pair_filter.mask = wp.array(mask, dtype=int, device=self.device)
+            arrays = (wp.array(bits.view(np.int32), dtype=int, device=self.device) for bits in (self.group, self.mask))
+            pair_filter.group, pair_filter.mask = arrays
         return pair_filter
 
     @functools.cached_property
@@ -252,10 +248,8 @@ class CollisionMesh:
         order = self.face_order
         of_cells = np.column_stack([self.cells, self.cell_owned]), self.cell_edges
         by_place = [values[order] if len(order) else values for values in of_cells]
-        return tuple(
-            wp.array(values.astype(np.int32, copy=False), dtype=int, device=self.device)
-            for values in (order, *by_place)
-        )
+        arrays = (values.astype(np.int32, copy=False) for values in (order, *by_place))
+        return tuple(wp.array(values, dtype=int, device=self.device) for values in arrays)
 
     @functools.cached_property
     def device_tets(self) -> wp.array:
@@ -306,30 +300,26 @@ class CollisionMesh:
         if elements.shape == (0,):
             elements = np.empty(shape, np.int32)
         if elements.ndim != len(shape) or elements.shape[1:] != shape[1:]:
-            raise ValueError(
-                f"{name}s must have shape {f'(n, {corners})' if corners > 1 else '(n,)'}, not {elements.shape}"
-            )
+            form = f"(n, {corners})" if corners > 1 else "(n,)"
+            raise ValueError(f"{name}s must have shape {form}, not {elements.shape}")
         if not np.issubdtype(elements.dtype, np.integer):
             raise ValueError(f"{name}s must be integers, not {elements.dtype}")
         if len(elements) >= 2**28:  # queues start with a capacity of eight pairs a face, and are indexed by int32
             raise ValueError(f"{name}s must have less than 2^28 rows, not {len(elements)}")
-        bad = np.flatnonzero(
-            ((elements < 0) | (elements >= self.vertex_count)).reshape(len(elements), corners).any(axis=1)
-        )
+        is_bad = (elements < 0) | (elements >= self.vertex_count)
+        bad = np.flatnonzero(is_bad.reshape(len(elements), corners).any(axis=1))
         if len(bad):
-            raise ValueError(
-                f"{name}s[{bad[0]}] is {elements[bad[0]].tolist()}, but the mesh has {self.vertex_count} vertices"
-                + (f" (so do {len(bad) - 1} other {name}s)" if len(bad) > 2 else "")
-            )
+            others = f" (so do {len(bad) - 1} other {name}s)" if len(bad) > 2 else ""
+            element = f"{name}s[{bad[0]}] is {elements[bad[0]].tolist()}"
+            raise ValueError(f"{element}, but the mesh has {self.vertex_count} vertices{others}")
         return np.ascontiguousarray(elements, dtype=np.int32)
 
     def _checked_world(self, world: ArrayLike | wp.array) -> np.ndarray:
         """Returns the world of each vertex, int32, shape [vertex_count], one for the vertices of a face or an edge."""
         worlds = as_numpy(world, "world")
-        if worlds.shape != (self.vertex_count,) or not np.issubdtype(worlds.dtype, np.integer):
-            raise ValueError(
-                f"world must be {self.vertex_count} integers, one a vertex, got {worlds.dtype} {worlds.shape}"
-            )
+        count = self.vertex_count
+        if worlds.shape != (count,) or not np.issubdtype(worlds.dtype, np.integer):
+            raise ValueError(f"world must be {count} integers, one a vertex, got {worlds.dtype} {worlds.shape}")
         bad = (worlds < 0) | (worlds >= 2**31)
         if bad.any():
             raise ValueError(f"world[{np.argmax(bad)}] must be in [0, 2^31), not {worlds[np.argmax(bad)]}")

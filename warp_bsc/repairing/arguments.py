@@ -68,9 +68,8 @@ def checked_sets(sets: Any, name: str, count: int) -> np.ndarray:
     if isinstance(sets, np.ndarray | wp.array):
         values = as_numpy(sets, name)
         if values.shape != (count,) or not np.issubdtype(values.dtype, np.integer):
-            raise ValueError(
-                f"{name} as an array must be {count} integers, one a vertex, not {values.dtype} {values.shape}"
-            )
+            what = f"{values.dtype} {values.shape}"
+            raise ValueError(f"{name} as an array must be {count} integers, one a vertex, not {what}")
         if values.min(initial=0) < -1 or values.max(initial=0) >= 2**31:
             raise ValueError(f"{name} must be in [-1, 2^31), not {values.min(initial=0)} to {values.max(initial=0)}")
         return values.astype(np.int64)

@@ -17,13 +17,8 @@ def closest_points(
     """
     target = _part(surface, x, faces)
     closest, normals = (wp.empty(len(points), dtype=wp.vec3, device=surface.device) for _ in range(2))
-    launch(
-        find_closest,
-        len(points),
-        inputs=[target.id, surface.array(points, wp.vec3)],
-        outputs=[closest, normals],
-        device=surface.device,
-    )
+    inputs, outputs = [target.id, surface.array(points, wp.vec3)], [closest, normals]
+    launch(find_closest, len(points), inputs=inputs, outputs=outputs, device=surface.device)
     return closest.numpy().astype(np.float64), normals.numpy().astype(np.float64)
 
 

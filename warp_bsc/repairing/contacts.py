@@ -126,11 +126,9 @@ def projected(
     at = wp.array(x[involved], dtype=wp.vec3d, device=device)
     shortfalls = wp.empty(count, dtype=wp.float64, device=device)
     vertices = wp.array(moving, dtype=int, device=device)
-    kernels = [
-        (find_shortfalls, count, [at, planes], [shortfalls]),
-        (move_apart, len(moving), [vertices, planes, shortfalls], [at]),
-    ]
-    launch_repeatedly(kernels, sweeps, device=device)
+    first = find_shortfalls, count, [at, planes], [shortfalls]
+    second = move_apart, len(moving), [vertices, planes, shortfalls], [at]
+    launch_repeatedly([first, second], sweeps, device=device)
     result = x.copy()
     result[involved] = at.numpy()
     return result

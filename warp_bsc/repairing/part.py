@@ -33,10 +33,9 @@ class Part(Surface):
         split = zip(np.split(cells, sizes), np.split(is_kept, sizes), strict=True)
         faces, edges, points = (own[kept] for own, kept in split)
         labels = {name: getattr(mesh, name) for name in ("world", "group", "mask")}
-        labels = {name: None if values is None else values[is_used] for name, values in labels.items()}
-        mesh = changed_mesh(
-            mesh, faces=faces, edges=edges[:, :2], points=points[:, 0], vertex_count=len(self.vertices), **labels
-        )
+        changes = {name: None if values is None else values[is_used] for name, values in labels.items()}
+        changes |= {"faces": faces, "edges": edges[:, :2], "points": points[:, 0]}
+        mesh = changed_mesh(mesh, vertex_count=len(self.vertices), **changes)
         fixed = whole.fixed[is_used] | self._shared
         super().__init__(mesh, whole.positions(whole.home)[is_used], fixed, rigid=whole.rigid.of[is_used])
         self.end = whole.end

@@ -120,18 +120,9 @@ def _gradients(surface: Surface, x: np.ndarray, crossings: np.ndarray) -> tuple[
     opposite = mesh.faces[faces].sum(axis=1) - mesh.edges[crossings[rows, 0]].sum(axis=1)
     along = wp.empty(n, dtype=wp.float64, device=surface.device)
     coordinates, gradient = (wp.empty(n, dtype=wp.vec3d, device=surface.device) for _ in range(2))
-    launch(
-        contour_gradients,
-        n,
-        inputs=[
-            surface.array(x),
-            mesh.device_edges,
-            mesh.device_faces,
-            surface.array(crossings, wp.vec2i),
-            surface.array(np.searchsorted(rows, np.arange(n + 1)), int),
-            surface.array(opposite, int),
-        ],
-        outputs=[along, coordinates, gradient],
-        device=surface.device,
-    )
+    starts = np.searchsorted(rows, np.arange(n + 1))
+    inputs = [surface.array(x), mesh.device_edges, mesh.device_faces, surface.array(crossings, wp.vec2i)]
+    inputs += [surface.array(values, int) for values in (starts, opposite)]
+    outputs = [along, coordinates, gradient]
+    launch(contour_gradients, n, inputs=inputs, outputs=outputs, device=surface.device)
     return along.numpy(), coordinates.numpy(), gradient.numpy()

@@ -116,9 +116,7 @@ def _contact_separate(contacts: SceneContacts, rows: slice) -> list[bool | None]
     return [one if phase >= 0 else None for phase, one in zip(phases, separate, strict=True)]
 
 
-_KIND = Column(
-    "kind", kind_words, "kind", lambda values: np.array([KINDS.index(kind) for kind in values], dtype=np.int64)
-)
+_KIND = Column("kind", kind_words, "kind", lambda values: np.array([KINDS.index(kind) for kind in values], np.int64))
 _TIME = Column("time", lambda pairs, rows: [pairs.time] * len(pairs.kind[rows]))
 _POSITION = _numbers("position", (-1, 3))
 _ELEMENTS = (
@@ -193,14 +191,8 @@ def _read_elements(interval: Interval, rows: list[dict], names: list[str]) -> di
         for end, members in ((0, ~of_face), (1, has_two)):
             vertices[members, side, end] = segment.find_vertices(meshes[members, side], indices[members, side, end])
         vertices[has_two, side] = np.sort(vertices[has_two, side], axis=1)
-    return {
-        "segment": segment,
-        "elements": elements,
-        "meshes": meshes,
-        "indices": indices,
-        "vertices": vertices,
-        "faces": faces,
-    }
+    arrays = {"elements": elements, "meshes": meshes, "indices": indices, "vertices": vertices, "faces": faces}
+    return {"segment": segment} | arrays
 
 
 # An interval -------------------------------------------------------------------------------------------------------
@@ -254,34 +246,25 @@ def read_result(
         names: Names of the meshes in the file.
     """
 
-    def rows_at(end: bool, *names: str) -> list[dict]:
+    def pairs_at(end: bool, columns: Sequence[Column], *lists: str) -> dict[str, Any]:
         rows = []
-        for name in names:
+        for name in lists:
             own = f"{name}{_AT_END}" if end else name
             rows += fields[own] if own in fields or following is None else following[name]
-        return rows
+        return _read_pairs(interval, rows, names, columns)
 
     moments = ((False, interval.start, interval.x0), (True, interval.end, interval.x1))
     summary = read_summary(fields, interval, names)
     intersections = proximities = None
     if "edges_through_faces" in fields:
-        start, end = (
-            SceneIntersections(
-                **_read_pairs(interval, rows_at(is_end, "edges_through_faces", "inside"), names, _INTERSECTIONS),
-                time=time,
-                x=x,
-                ignored=at.ignored,
-            )
-            for at, (is_end, time, x) in zip(summary.intersections or (), moments, strict=True)
-        )
-        intersections = start, end
+        found = []
+        for at, (is_end, time, x) in zip(summary.intersections or (), moments, strict=True):
+            pairs = pairs_at(is_end, _INTERSECTIONS, "edges_through_faces", "inside")
+            found.append(SceneIntersections(**pairs, time=time, x=x, ignored=at.ignored))
+        intersections = found[0], found[1]
     if "proximity_pairs" in fields:
-        start, end = (
-            SceneProximities(
-                **_read_pairs(interval, rows_at(is_end, "proximity_pairs"), names, _PROXIMITIES), time=time
-            )
-            for is_end, time, _ in moments
-        )
+        found = [(pairs_at(is_end, _PROXIMITIES, "proximity_pairs"), time) for is_end, time, _ in moments]
+        start, end = (SceneProximities(**pairs, time=time) for pairs, time in found)
         proximities = start, end
     rows = fields["contacts"]
     contacts = SceneContacts(

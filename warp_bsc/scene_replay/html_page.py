@@ -35,13 +35,8 @@ def fill_page(page: Traversable, scripts: Iterable[Traversable], title: str) -> 
     """
     style = shared_part("page.css").read_text(encoding="utf-8")
     script = "\n".join(part.read_text(encoding="utf-8") for part in scripts)
-    fields = {
-        "title": html.escape(title),
-        "style_hash": _policy_hash(style),
-        "script_hash": _policy_hash(script),
-        "style": style,
-        "script": script,
-    }
+    fields = {"title": html.escape(title), "style": style, "script": script}
+    fields |= {"style_hash": _policy_hash(style), "script_hash": _policy_hash(script)}
     # Text, name, text, name, ...: the filled-in texts may contain braces.
     parts = page.read_text(encoding="utf-8").replace("{{", "}}").split("}}")
     filled = [fields.get(part, part) if index % 2 else part for index, part in enumerate(parts)]

@@ -121,17 +121,14 @@ def report_data(summary: Summary, baseline: Baseline | None) -> dict:
     new = None if baseline is None else baseline.new_in(summary)
     scene = summary.scene
     named = [(f"Mesh {name}", shown) for name in scene.names if (shown := scene.display_names[name])]
-    looked = bool(summary.intersections)
-    intersecting = sum(not at.is_empty for at in summary.intersections)
     tiles = [] if new is None else [(f"{len(new):,}", "new against the baseline")]
-    tiles += [
-        (f"{summary.hits:,}", "collisions"),
-        (f"{len(summary.colliding):,} of {len(summary.intervals):,}", "intervals with collisions"),
-    ]
+    tiles.append((f"{summary.hits:,}", "collisions"))
+    tiles.append((f"{len(summary.colliding):,} of {len(summary.intervals):,}", "intervals with collisions"))
     if summary.colliding and (first := summary.colliding[0].earliest):
         tiles.append((f"{first.time:.6g}", "time code of the first"))
-    if looked:
-        tiles.append((f"{intersecting:,} of {len(summary.intersections):,}", "times with intersections at rest"))
+    if at_rest := summary.intersections:
+        intersecting = sum(not at.is_empty for at in at_rest)
+        tiles.append((f"{intersecting:,} of {len(at_rest):,}", "times with intersections at rest"))
     if spans := summary.duplicate_spans:
         tiles.append((f"{len({name for span in spans for name in span.meshes}):,}", "meshes that are duplicates"))
     if inversions := summary.inversion_spans:
@@ -190,9 +187,8 @@ def report_data(summary: Summary, baseline: Baseline | None) -> dict:
         "validation": None,
     }
     if not summary.is_complete:
-        data["partial"] = (
-            f"Partial: {len(summary.intervals)} of {summary.interval_count} intervals were checked; {summary.stopped}."
-        )
+        checked = f"{len(summary.intervals)} of {summary.interval_count} intervals were checked"
+        data["partial"] = f"Partial: {checked}; {summary.stopped}."
     if not data["nothing"]:
         data["partial"] = " ".join(filter(None, (data["partial"], summary.not_checked)))
     if found := summary.validation:

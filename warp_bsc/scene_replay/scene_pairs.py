@@ -109,13 +109,9 @@ class ScenePairs:
     def triangles(self, rows: slice) -> list[int | None]:
         """Returns the number of each pair's face among the triangles of its polygon, from 0; None without a face."""
         faces = self.faces[rows].max(axis=1)
-        triangles: list[int | None] = [None] * len(faces)
-        (of_faces,) = np.nonzero(faces >= 0)
-        for row, triangle in zip(
-            of_faces.tolist(), self.segment.triangles_in_polygons(faces[of_faces]).tolist(), strict=True
-        ):
-            triangles[row] = triangle
-        return triangles
+        triangles = np.full(len(faces), None)
+        triangles[faces >= 0] = self.segment.triangles_in_polygons(faces[faces >= 0])
+        return triangles.tolist()
 
     def _of_meshes(self, attribute, rows) -> list[tuple[str, str]]:
         """Returns an attribute of the two meshes of some pairs; pairs of the same meshes share them."""
@@ -194,14 +190,8 @@ def name_elements(
                 all_vertices[rows, side] = own
                 meshes[rows, side], indices[rows, side], diagonal = segment.locate_edges(own)
                 elements[rows, side][diagonal] = DIAGONAL
-    return {
-        "kind": np.repeat(np.arange(len(blocks)), counts),
-        "elements": elements,
-        "meshes": meshes,
-        "indices": indices,
-        "vertices": all_vertices,
-        "faces": all_faces,
-    }
+    arrays = {"elements": elements, "meshes": meshes, "indices": indices, "vertices": all_vertices, "faces": all_faces}
+    return {"kind": np.repeat(np.arange(len(blocks)), counts)} | arrays
 
 
 def take_rows(arrays: dict[str, np.ndarray], which: np.ndarray) -> dict[str, np.ndarray]:

@@ -203,8 +203,7 @@ class Summary:
     def collision_spans(self) -> list[CollisionSpan]:
         """The times over which two meshes collide, by their start, then by descending number of hits."""
         begun = (
-            [CollisionSpan(meshes, at.start, at.end, hits) for meshes, hits in at.mesh_pairs.items()]
-            for at in self.intervals
+            [CollisionSpan(pair, at.start, at.end, n) for pair, n in at.mesh_pairs.items()] for at in self.intervals
         )
         joined = _joined(begun, lambda a, b: replace(a, until=b.until, hits=a.hits + b.hits))
         return sorted(joined, key=lambda span: (span.since, -span.hits))

@@ -135,15 +135,9 @@ def _intersection_fields(found: IntersectionSummary, numbers: Mapping[str, int])
         {"mesh": [numbers[name] for name in meshes], "crossings": crossings, "touches": touches}
         for meshes, (crossings, touches) in found.mesh_pairs.items()
     ]
-    inside = mesh_pairs_to_list(found.inside.items(), numbers, "parts")
-    return {
-        "time": found.time,
-        "crossings": found.crossings,
-        "touches": found.touches,
-        "mesh_pairs": pairs,
-        "inside": inside,
-        "ignored": mesh_pairs_to_list(found.ignored.items(), numbers, "edges"),
-    }
+    lists = {"mesh_pairs": pairs, "inside": mesh_pairs_to_list(found.inside.items(), numbers, "parts")}
+    lists["ignored"] = mesh_pairs_to_list(found.ignored.items(), numbers, "edges")
+    return {"time": found.time, "crossings": found.crossings, "touches": found.touches} | lists
 
 
 def _read_intersections(fields: dict[str, Any], names: list[str]) -> IntersectionSummary:

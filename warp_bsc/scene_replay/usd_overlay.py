@@ -61,21 +61,13 @@ _CURVE_WIDTH = 0.0015  # width of the curves, too
 
 _EXTENT = {"extent": "float3[]"}
 _MARKERS = _EXTENT | {"positions": "point3f[]", "protoIndices": "int[]"}
-_ELEMENTS = {
-    "primvars:primA": "int[]",
-    "primvars:primB": "int[]",
-    "primvars:elementA": "int2[]",
-    "primvars:elementB": "int2[]",
-}
+_PRIMS = dict.fromkeys(("primvars:primA", "primvars:primB"), "int[]")
+_ELEMENTS = _PRIMS | dict.fromkeys(("primvars:elementA", "primvars:elementB"), "int2[]")
 _CONTACTS = _MARKERS | {"primvars:toi": "float[]"} | _ELEMENTS
 _PARTS: dict[str, tuple[PrimKind, dict[str, str]]] = {
     "Polygons": ("Mesh", _EXTENT | {"faceVertexCounts": "int[]", "faceVertexIndices": "int[]", "points": "point3f[]"}),
     **dict.fromkeys(_KINDS, ("PointInstancer", _CONTACTS)),
-    "Intersections": (
-        "BasisCurves",
-        _EXTENT
-        | {"points": "point3f[]", "curveVertexCounts": "int[]", "primvars:primA": "int[]", "primvars:primB": "int[]"},
-    ),
+    "Intersections": ("BasisCurves", _EXTENT | {"points": "point3f[]", "curveVertexCounts": "int[]"} | _PRIMS),
     "CurveIntersections": ("PointInstancer", _MARKERS | _ELEMENTS),
     "Inside": ("PointInstancer", _MARKERS | _ELEMENTS),
     "Near": ("PointInstancer", _MARKERS | {"primvars:distance": "float[]"} | _ELEMENTS),

@@ -78,11 +78,9 @@ class ViewBlocks:
         if not are_all:
             if self._outline is None or self._outline[0] is not segment:
                 outline = find_outline(segment, interval.x0, self._most_outline)
-                arrays_of_outline = {
-                    "faces": outline.faces,
-                    "mesh_of_vertex": numbers[segment.locate_vertices(outline.vertices)[0]],
-                }
-                texts.append(block(f"outline-{interval.index}", {}, arrays_of_outline))
+                meshes = numbers[segment.locate_vertices(outline.vertices)[0]]
+                of_outline = {"faces": outline.faces, "mesh_of_vertex": meshes}
+                texts.append(block(f"outline-{interval.index}", {}, of_outline))
                 self._outline = segment, interval.index, outline.vertices
             facts["outline"] = self._outline[1]
             facts["outline_step"], of_outline = moving_points(*(x[self._outline[2]] for x in at_ends))

@@ -268,11 +268,8 @@ def device_of_cluster(address: str, name: str | None) -> str:
         OSError: As of :class:`Cluster`.
         ValueError: If a worker has no such device.
     """
-    cluster = Cluster(str(checked_workers(address, name)))
-    try:
+    with contextlib.closing(Cluster(str(checked_workers(address, name)))) as cluster:
         return cluster.result(cluster.submit(name_device, name))
-    finally:
-        cluster.close()
 
 
 @dataclass

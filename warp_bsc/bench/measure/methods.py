@@ -303,10 +303,8 @@ class MethodRun:
             launch_over(cull_batches, batches, inputs=[given], outputs=outputs, device=device, chunk=16)
         else:
             launch_over(cull, queries.count, inputs=[given], outputs=outputs, device=device)
-        inputs = [given, self._survivors, self._survivor_count]
-        launch_over_queue(
-            classify_survivors, self._survivors, self._survivor_count, 0, inputs=inputs, outputs=[self._status]
-        )
+        queue, inputs = (self._survivors, self._survivor_count), [given, self._survivors, self._survivor_count]
+        launch_over_queue(classify_survivors, *queue, 0, inputs=inputs, outputs=[self._status])
 
     def read_status(self) -> np.ndarray:
         """Returns the status of each query after a launch: FREE, HIT or UNSURE, int8, shape [n]; not if repeated."""

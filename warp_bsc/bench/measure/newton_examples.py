@@ -154,15 +154,8 @@ def measure_example(
     needs = describe_needs(example, download=download)
     if needs:
         return ExampleRun(example.title, mode, problem=needs[0])
-    request = {
-        "module": example.module,
-        "options": example.options,
-        "mode": mode,
-        "device": device,
-        "frames": frames,
-        "check_every": check_every,
-        "download": download,
-    }
+    request = {"module": example.module, "options": example.options, "mode": mode, "device": device}
+    request |= {"frames": frames, "check_every": check_every, "download": download}
     with tempfile.TemporaryFile() as errors:
         last: dict[str, Any] = {}
         for reply in _replies(request, errors):

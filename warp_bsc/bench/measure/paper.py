@@ -200,18 +200,15 @@ def gather_queries(
         overlapping += number
         share = min(1.0, max_queries / len(intervals) / max(number, 1))
         for kind, (kind_elements, kind_pairs) in found.items():
-            before = [
-                vertices if kind == PairKind.VERTEX_FACE else sum(map(len, elements[kind])),
-                sum(map(len, elements[kind])),
-            ]
+            of_elements = sum(map(len, elements[kind]))
+            before = [vertices if kind == PairKind.VERTEX_FACE else of_elements, of_elements]
             count = int(np.ceil(share * len(kind_pairs)))
             chosen = np.sort(random.permutation(len(kind_pairs))[:count])
             pairs[kind].append(kind_pairs[chosen] + np.array(before, dtype=np.int32))
             elements[kind].append(kind_elements + vertices)
         vertices += len(scene.x0)
-    queries = {
-        kind: Queries(kind, x0, x1, np.concatenate(elements[kind]), np.concatenate(pairs[kind])) for kind in elements
-    }
+    joined = {kind: (np.concatenate(elements[kind]), np.concatenate(pairs[kind])) for kind in elements}
+    queries = {kind: Queries(kind, x0, x1, *both) for kind, both in joined.items()}
     return {kind: found for kind, found in queries.items() if len(found)}, overlapping
 
 

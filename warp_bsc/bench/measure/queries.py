@@ -257,18 +257,16 @@ def benchmark_queries(
     for mode in runs.keys() - {"exact"}:
         different = int((results[mode] != results["status"]).sum())
         if different:
-            raise RuntimeError(
-                f"{different} of {count} {kind.display_name} queries were decided differently by mode {mode}"
-            )
+            which = f"{different} of {count} {kind.display_name} queries"
+            raise RuntimeError(f"{which} were decided differently by mode {mode}")
     answers, survivors_left = results["status"].copy(), int(counts.numpy()[0])
+    names = {"free": FREE, "hit": HIT, "unsure": UNSURE}
     measured = {
         "kind": kind.display_name,
         "queries": count,
         "survivors": survivors_left,
         "survivor_share": survivors_left / count,
-        "certified": {
-            name: int((answers == answer).sum()) for name, answer in (("free", FREE), ("hit", HIT), ("unsure", UNSURE))
-        },
+        "certified": {name: int((answers == answer).sum()) for name, answer in names.items()},
         "modes": milliseconds,
     }
     return measured, answers

@@ -163,15 +163,8 @@ def measure_repair(kind: str, name: str, mesh: TangledMesh, *, device: wp.Device
     if free is not None:
         again = repair(mesh.faces, free, fixed=mesh.fixed, device=device)
         keeps_free = again.certified and np.asarray(again.x).tobytes() == np.asarray(free).tobytes()
-    return RepairRun(
-        kind=kind,
-        name=name,
-        vertices=len(mesh.x),
-        faces=len(mesh.faces),
-        crossings=result.crossings_before,
-        attempts=tuple(attempts),
-        keeps_free=keeps_free,
-    )
+    sizes = {"vertices": len(mesh.x), "faces": len(mesh.faces), "crossings": result.crossings_before}
+    return RepairRun(kind, name, **sizes, attempts=tuple(attempts), keeps_free=keeps_free)
 
 
 def summarize(runs: Sequence[RepairRun]) -> dict[str, Any]:

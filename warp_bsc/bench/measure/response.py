@@ -14,20 +14,8 @@ from ..._arguments import checked_choice, checked_number
 from ..record import Run, silenced
 from ..tables import Column, Table, count, grouped, in_thousands
 
-SCENES = (
-    "sphere",
-    "box_edge",
-    "tube_cone",
-    "fold",
-    "soft_bowl",
-    "pile",
-    "press",
-    "press_tight",
-    "ropes",
-    "ball",
-    "ball_two_way",
-    "worlds",
-)
+_NAMES = "sphere box_edge tube_cone fold soft_bowl pile press press_tight ropes ball ball_two_way worlds"
+SCENES = tuple(_NAMES.split())
 """Names of the scenes."""
 
 REFERENCE = "reference"
@@ -217,10 +205,8 @@ def measure_response(
             measured, early = run(0, 0.0)
             if perturb is not None and passes == 2:
                 moved, _ = run(1, perturb)
-                differences = {
-                    name: abs(moved[name] - measured[name]) for name in ("stretch_at_end", "stretch_at_most")
-                }
-                measured["spread"] = {"distance": perturb} | differences
+                names = "stretch_at_end", "stretch_at_most"
+                measured["spread"] = {"distance": perturb} | {n: abs(moved[n] - measured[n]) for n in names}
     except (NotRunnable, NotFinite) as reason:
         return ResponseRun(scene, solver, configuration, problem=str(reason))
     return ResponseRun(scene, solver, configuration, early, measured=measured)

@@ -74,19 +74,8 @@ def simulate_newton(
     if solver != "implicit":
         own = self_contact(built.margin, built.gap) if has_self_contact else {"particle_enable_self_contact": False}
         inner = make_solver(model, solver, _STYLE3D_ITERATIONS if solver == "style3d" else _ITERATIONS, **own)
-    simulation = Simulation(
-        built.scene,
-        solver,
-        rate,
-        has_contacts=not has_stage,
-        stage_options={} if has_stage else None,
-        inner=inner,
-        samples=states,
-    )
+    options = {"has_contacts": not has_stage, "stage_options": {} if has_stage else None}
+    simulation = Simulation(built.scene, solver, rate, **options, inner=inner, samples=states)
     simulation.run(seconds, progress)
-    stage = simulation.stage
-    return Trajectory(
-        states.positions,
-        simulation.milliseconds,
-        uncertified_steps=stage.report.totals.uncertified_steps if stage else None,
-    )
+    uncertified = simulation.stage.report.totals.uncertified_steps if simulation.stage else None
+    return Trajectory(states.positions, simulation.milliseconds, uncertified)

@@ -118,17 +118,10 @@ class SceneBuilder:
             raise NotRunnable("Style3D needs the cut of a cloth in its plane, and a tube has none here")
         a, b, c = points[faces].transpose(1, 0, 2)
         area = 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
-        self.to.add_cloth_mesh(
-            pos=wp.vec3(),
-            rot=_IDENTITY,
-            scale=1.0,
-            vel=wp.vec3(),
-            vertices=[wp.vec3(*point) for point in points],
-            indices=faces.ravel().tolist(),
-            density=density,
-            particle_radius=radius,
-            **self._membrane(stiffness, density * area / len(points)),
-        )
+        options = {"pos": wp.vec3(), "rot": _IDENTITY, "scale": 1.0, "vel": wp.vec3(), "particle_radius": radius}
+        options |= {"vertices": [wp.vec3(*point) for point in points], "indices": faces.ravel().tolist()}
+        options |= self._membrane(stiffness, density * area / len(points))
+        self.to.add_cloth_mesh(**options, density=density)
 
     def add_block(
         self, at: tuple[float, float, float], cells: int, cell: float, *, stiffness: float = 2e4, turn: float = 0.0

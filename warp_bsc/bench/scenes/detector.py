@@ -155,9 +155,8 @@ def _find_generator(name: str, generator: str, triangles: str) -> tuple[np.ndarr
     if generator not in GENERATORS:
         raise ValueError(f"{name}: there is no generator {generator}, only {', '.join(GENERATORS)}")
     if not re.fullmatch(r"[0-9]{1,9}", triangles) or not _MIN_TRIANGLES <= int(triangles) <= _MAX_TRIANGLES:
-        raise ValueError(
-            f"{name}: the number of triangles must be in [{_MIN_TRIANGLES}, {_MAX_TRIANGLES}], not {triangles!r}"
-        )
+        bounds = f"[{_MIN_TRIANGLES}, {_MAX_TRIANGLES}]"
+        raise ValueError(f"{name}: the number of triangles must be in {bounds}, not {triangles!r}")
     return GENERATORS[generator](int(triangles))
 
 

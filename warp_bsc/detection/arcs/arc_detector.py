@@ -3,14 +3,15 @@
 import numpy as np
 import warp as wp
 
+from ..mesh import changed_mesh
 from ..narrow.contact_buffer import ContactRows, contacts_from_host
 from ..pipeline import DetectionPipeline
 from ..results.collision_finder import CollisionFinder
 from ..results.collisions import CapturedCollisions, Collisions
 from ..run.phase_timer import PhaseTimer
 from ..run.settings import add_counts
-from .arc_pipeline import LARGEST_TURN, ArcPipeline
-from .arc_search import ArcSearch, join_contacts, straight_mesh
+from .arc_pipeline import ArcPipeline
+from .arc_search import ArcSearch, join_contacts
 from .rigid_motion import ArcBounds, RigidMotion
 
 
@@ -43,7 +44,7 @@ class ArcDetector:
             raise ValueError("rigid_motion: x0 and x1 must not require gradients")
         mesh, method, body = self._straight.mesh, self._straight.method, arcs.body
         bounds = ArcBounds(arcs, mesh.device_vertices, x0, x1)
-        if self._straight.radius is None and ArcPipeline.is_for(bounds):
+        if self._straight.radius is None and ArcPipeline.is_for(arcs):
             at_once = self.at_once
             if at_once is None or not np.array_equal(at_once.body, body):
                 at_once = self.at_once = ArcPipeline(self._straight, bounds)
@@ -55,8 +56,10 @@ class ArcDetector:
         if self._by_parts is None or not np.array_equal(self._by_parts[0].body, body):
             others = None
             if (body[mesh.vertices] < 0).any():
+                # pairs with a vertex that turns are left out
+                group = np.where(body >= 0, np.uint32(0), np.uint32(1) if mesh.group is None else mesh.group)
                 options = {"method": method, "tolerance": self._straight.tolerance, "only_used_vertices": True}
-                apart = DetectionPipeline(straight_mesh(mesh, body >= 0), **self._distances, **options)
+                apart = DetectionPipeline(changed_mesh(mesh, group=group), **self._distances, **options)
                 others = CollisionFinder(apart, self._straight.broad_phase.lock)
             self._by_parts = ArcSearch(self._straight, body, **self._distances), others
         search, others = self._by_parts
@@ -77,16 +80,13 @@ class ArcDetector:
 
         Arguments are those of the last call of :meth:`find`, errors those of :meth:`.CollisionDetector.capture`.
         """
+        refusal = "rigid_motion: a graph holds {}; detect outside the graph"
         if self._straight.radius is not None:
-            raise NotImplementedError(
-                "rigid_motion: a graph holds none with min_distance or radius; detect outside the graph"
-            )
+            raise NotImplementedError(refusal.format("none with min_distance or radius"))
         at_once = self.at_once
         if at_once is None or at_once.bounds.motion is not arcs:
-            if (np.linalg.norm(arcs.turn, axis=1) > LARGEST_TURN).any():
-                raise NotImplementedError(
-                    "rigid_motion: a graph holds turns of at most a quarter of a turn; detect outside the graph"
-                )
+            if not ArcPipeline.is_for(arcs):
+                raise NotImplementedError(refusal.format("turns of at most a quarter of a turn"))
             raise RuntimeError("detect with this rigid_motion once before capturing, which copies them to the device")
         if x0.requires_grad or x1.requires_grad:
             raise ValueError("rigid_motion: x0 and x1 must not require gradients")

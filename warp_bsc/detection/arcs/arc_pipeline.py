@@ -13,9 +13,9 @@ from ..pipeline import DetectionPipeline
 from ..results.collision_finder import CollisionFinder
 from ..run.launch import launch, made_once
 from ..run.settings import NO_FUSED_OPERATIONS, PairKind
-from .rigid_motion import ArcBounds
+from .rigid_motion import ArcBounds, RigidMotion
 
-LARGEST_TURN = 0.5 * np.pi
+_LARGEST_TURN = 0.5 * np.pi
 """Turn up to which one pass takes less time than parts of the step: its boxes reach beyond chords by the deviation over
 the whole step, which is at most 0.31 of the distance from the axis."""
 
@@ -57,9 +57,9 @@ class ArcPipeline:
         self.finder = CollisionFinder(self.pipeline, straight.broad_phase.lock)
 
     @staticmethod
-    def is_for(bounds: ArcBounds) -> bool:
+    def is_for(motion: RigidMotion) -> bool:
         """Returns whether one pass decides a motion in less time than parts of the step."""
-        return bool((np.linalg.norm(bounds.motion.turn, axis=1) <= LARGEST_TURN).all())
+        return bool((np.linalg.norm(motion.turn, axis=1) <= _LARGEST_TURN).all())
 
     def has_unsure_pairs(self, contacts: dict[PairKind, ContactRows]) -> bool:
         """Returns whether the last run reports a pair on arcs that took too many parts of the step to decide.

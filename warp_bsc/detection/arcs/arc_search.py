@@ -8,12 +8,11 @@ to a quarter, without minimum distances, take less time in one pass, see :mod:`.
 """
 
 import dataclasses
-from dataclasses import fields
+import functools
 
 import numpy as np
 import warp as wp
 
-from ..mesh import CollisionMesh, changed_mesh
 from ..narrow.contact_buffer import HostContacts, empty_contacts, read_contacts
 from ..narrow.on_host import pair_distances
 from ..pipeline import DetectionPipeline
@@ -25,12 +24,6 @@ from .rigid_motion import ArcBounds
 _COARSE = 0.25
 """Largest deviation in the parts that a search begins with, as a share of the mean edge of turning bodies: boxes then
 are not much larger than those of their elements."""
-
-
-def straight_mesh(mesh: CollisionMesh, turns: np.ndarray) -> CollisionMesh:
-    """Returns a mesh with the same elements, in which pairs with a vertex that turns are left out."""
-    group = np.uint32(1) if mesh.group is None else mesh.group
-    return changed_mesh(mesh, group=np.where(turns, np.uint32(0), group))
 
 
 class ArcSearch:
@@ -48,15 +41,9 @@ class ArcSearch:
         """
         self.body = body
         self._mesh = mesh = straight.mesh
-        self._pipeline = DetectionPipeline(
-            mesh,
-            method="float" if straight.method == "float" else "conservative",
-            tolerance=straight.tolerance,
-            min_distance=min_distance,
-            rings=rings,
-            body=body,
-            only_used_vertices=True,
-        )
+        options = {"method": "float" if straight.method == "float" else "conservative", "tolerance": straight.tolerance}
+        options |= {"min_distance": min_distance, "rings": rings, "only_used_vertices": True}
+        self._pipeline = DetectionPipeline(mesh, body=body, **options)
         self._elements = {n.kind: mesh.elements(n.kind) for n in self._pipeline.narrow_phases}
 
     def find(
@@ -66,9 +53,9 @@ class ArcSearch:
 
         Other arguments than the motion and its bounds are those of :meth:`.DetectionPipeline.find_contacts`.
         """
-        self._bounds, self._changed, self._timer = bounds, changed, timer
+        self._bounds, self._timer = bounds, timer
+        self._deviation = functools.cache(bounds.deviation)  # by level
         self._pipeline.set_bodies(bounds.body)
-        self._deviations: dict[int, np.ndarray] = {}
         self._counts: Counts | None = None
         self._found: dict[PairKind, list[HostContacts]] = {kind: [] for kind in self._elements}
         self._keys = {kind: np.zeros(0, dtype=np.int64) for kind in self._elements}
@@ -82,13 +69,11 @@ class ArcSearch:
         """Returns the number of halvings after which deviations are small against edges, or within the tolerance."""
         mesh, lever = self._mesh, self._bounds.lever
         of_bodies = mesh.edges[(lever[mesh.edges] > 0.0).any(axis=1)]
-        most = 0.25 * self._bounds.tolerance
+        size = lever.max(initial=0.0)
         if len(of_bodies):
             ends = x0.numpy()[of_bodies].astype(np.float64)
-            most = max(most, _COARSE * float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).mean()))
-        else:
-            most = max(most, _COARSE * float(lever.max(initial=0.0)))
-        level = 0
+            size = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).mean()
+        level, most = 0, max(0.25 * self._bounds.tolerance, _COARSE * float(size))
         while self._deviation(level).max(initial=0.0) > most:
             level += 1
         return level
@@ -118,9 +103,8 @@ class ArcSearch:
         pipeline, timer = self._pipeline, self._timer
         pipeline.add_to_radius(self._deviation(level))
         start, end = (self._bounds.place((part + i) * 2.0**-level) for i in range(2))
-        retry_until_fits(
-            lambda: pipeline.find_contacts(start, end, changed=changed, timer=timer), pipeline, self._mesh.device
-        )
+        find = functools.partial(pipeline.find_contacts, start, end, changed=changed, timer=timer)
+        retry_until_fits(find, pipeline, self._mesh.device)
         # what floating point has left to exact arithmetic stays as it is
         pairs = {kind.label: counts._replace(for_exact=0) for kind, counts in pipeline.counts.pairs.items()}
         counts = dataclasses.replace(pipeline.counts, **pairs)
@@ -131,19 +115,12 @@ class ArcSearch:
                 for phase in pipeline.narrow_phases
             }
 
-    def _deviation(self, level: int) -> np.ndarray:
-        """Returns the bounds of the deviations in parts that last 2^-level, float64, shape [vertex_count]."""
-        if level not in self._deviations:
-            self._deviations[level] = self._bounds.deviation(level)
-        return self._deviations[level]
-
 
 def join_contacts(parts: list[HostContacts]) -> HostContacts:
     """Returns contacts of different pairs together, sorted by their pairs."""
     parts = [part for part in parts if len(part.pairs)]
     if not parts:
         return empty_contacts()
-    joined = HostContacts(
-        **{field.name: np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(HostContacts)}
-    )
+    names = [field.name for field in dataclasses.fields(HostContacts)]
+    joined = HostContacts(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
     return joined.rows(np.lexsort((joined.pairs[:, 1], joined.pairs[:, 0])))

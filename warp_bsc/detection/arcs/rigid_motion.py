@@ -101,20 +101,17 @@ class RigidMotion:
         angle = np.linalg.norm(self.turn, axis=1)
         bad = ~((self.turn == 0.0).all(axis=1) | ((angle >= _SMALLEST_TURN) & (angle <= _LARGEST_TURN)))
         if bad.any():
-            raise ValueError(
-                f"turn[{np.argmax(bad)}] must be 0, or from 2^-400 to {_LARGEST_TURN:g} rad, not {angle[bad][0]:g}"
-            )
+            at = int(np.argmax(bad))
+            raise ValueError(f"turn[{at}] must be 0, or from 2^-400 to {_LARGEST_TURN:g} rad, not {angle[at]:g}")
         bodies = as_numpy(body, "body", "an array of integers")
         if bodies.dtype.kind not in "iu":
             raise TypeError(f"body must be an array of integers, not of {bodies.dtype}")
         if bodies.ndim != 1:
             raise ValueError(f"body must have shape (vertex_count,), not {bodies.shape}")
-        bad = (bodies < -1) | (bodies >= len(self.centre))
+        bad = (bodies < -1) | (bodies >= (count := len(self.centre)))
         if bad.any():
-            which = int(np.argmax(bad))
-            raise ValueError(
-                f"body[{which}] must be -1 or one of {len(self.centre)} bodies from 0, not {bodies[which]}"
-            )
+            at = int(np.argmax(bad))
+            raise ValueError(f"body[{at}] must be -1 or one of {count} bodies from 0, not {bodies[at]}")
         self.body = bodies.astype(np.int32)
         for values in (self.body, self.centre, self.turn):  # copies, as detections keep them on the device
             values.flags.writeable = False
@@ -210,19 +207,12 @@ def points_on_arcs(
     if not (body >= 0).any():
         return straight
     turn = np.where(body[..., None] >= 0, motion.turn[body], 0.0)
-    across, inward = _levers(start - motion.centre[body], turn)
-    angle = np.linalg.norm(turn, axis=-1, keepdims=True)
-    sine = np.sin(time * angle) - time * np.sin(angle)
-    versine = 2.0 * (np.sin(0.5 * time * angle) ** 2 - time * np.sin(0.5 * angle) ** 2)
-    return straight + sine * across + versine * inward
-
-
-def _levers(r: np.ndarray, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns k x r and k x (k x r), with k the unit vector of a turn, each of shape [..., 3]; 0 without a turn."""
     angle = np.linalg.norm(turn, axis=-1, keepdims=True)
     axis = turn / np.where(angle == 0.0, 1.0, angle)
-    across = np.cross(axis, r)
-    return across, np.cross(axis, across)
+    across = np.cross(axis, start - motion.centre[body])
+    sine = np.sin(time * angle) - time * np.sin(angle)
+    versine = 2.0 * (np.sin(0.5 * time * angle) ** 2 - time * np.sin(0.5 * angle) ** 2)
+    return straight + sine * across + versine * np.cross(axis, across)
 
 
 @wp.struct
@@ -364,10 +354,8 @@ class ArcBounds:
         self.body = np.where(np.append(self.are_rigid(), True)[motion.body], motion.body, NOT_RIGID).astype(np.int32)
         least = 16.0 * float(values[2])  # that parts of the step can reach
         if motion.tolerance is not None and motion.tolerance < least:
-            raise ValueError(
-                f"arcs.tolerance must be at least {least:g}, as positions between the ends are rounded, not "
-                f"{motion.tolerance:g}"
-            )
+            why = "as positions between the ends are rounded"
+            raise ValueError(f"arcs.tolerance must be at least {least:g}, {why}, not {motion.tolerance:g}")
         self.tolerance: float = motion.tolerance or max(_DEFAULT_TOLERANCE * float(values[3]), least)
 
     def measure(self, x0: wp.array, x1: wp.array) -> None:

@@ -83,11 +83,10 @@ class BodyParts:
         """
         rows, of_edge = self._parts_at_edges(self._edges[found.pairs[:, 0]].astype(np.int64))
         keys = pair_keys(np.stack([of_edge, self.of_face[found.pairs[rows, 1]]], axis=1), len(self.body))
-        shared = self._node_vertices[self._sharing]
-        _, firsts, counts = np.unique(shared, return_index=True, return_counts=True)
-        of_node = self._of_node[self._sharing]
-        ranges = np.repeat(firsts, counts), np.repeat(firsts + counts, counts)
-        one, other = expand_ranges(*ranges)
+        first_shared = len(self._first_node)  # nodes of the vertices that bodies share, sorted by vertex
+        _, firsts, counts = np.unique(self._node_vertices[first_shared:], return_index=True, return_counts=True)
+        of_node = self._of_node[first_shared:]
+        one, other = expand_ranges(np.repeat(firsts, counts), np.repeat(firsts + counts, counts))
         sharing = pair_keys(np.stack([of_node[one], of_node[other]], axis=1), len(self.body))
         return distinct(np.concatenate([keys, sharing])), distinct(keys[found.crosses[rows]])
 
@@ -115,11 +114,6 @@ class BodyParts:
         keys = pair_keys(np.stack([part, body], axis=1), int(self.body.max()) + 1)
         order = np.argsort(keys, kind="stable")
         return keys[order], ends[order].astype(np.int64)
-
-    @property
-    def _sharing(self) -> slice:
-        """The nodes of the vertices that bodies share, sorted by vertex."""
-        return slice(len(self._first_node), None)
 
     def _parts_at(self, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns all parts that have each vertex: rows of the argument, and the parts."""

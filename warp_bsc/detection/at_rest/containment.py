@@ -226,11 +226,8 @@ class ContainmentFinder:
         pairs, rows = pairs[passes], rows[passes]
         signs, faces = signs[pairs], faces[met[pairs, 1]]
         keys, pair_of_ray = np.unique(rows * len(parts.body) + parts.of_face[faces], return_inverse=True)
-        turns = np.where(
-            parts.oriented[keys % len(parts.body)],
-            np.bincount(pair_of_ray, signs, len(keys)),
-            np.bincount(pair_of_ray, minlength=len(keys)) % 2,
-        )
+        windings, passes = np.bincount(pair_of_ray, signs, len(keys)), np.bincount(pair_of_ray, minlength=len(keys))
+        turns = np.where(parts.oriented[keys % len(parts.body)], windings, passes % 2)
         inside = np.bincount(keys // len(parts.body), turns, len(place)) != 0
         return _Sides(on_surface, inside, rows, faces)
 

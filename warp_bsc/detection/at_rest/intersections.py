@@ -113,8 +113,7 @@ def _decided(
     for limbs in BITS:
         if not (status[:count].numpy() == UNSURE).any():
             break
-        inputs = [x, edges, mesh.device_faces, across, pairs]
-        kernel = _decide_exactly(x.dtype, limbs)
+        kernel, inputs = _decide_exactly(x.dtype, limbs), [x, edges, mesh.device_faces, across, pairs]
         launch_over(kernel, count, inputs=inputs, outputs=[status], device=mesh.device, block_dim=64)
     return status[:count].numpy()
 
@@ -242,7 +241,10 @@ class IntersectionFinder:
         def launch() -> None:
             self._counters.array.zero_()
             enqueue(x)
-            self._keep_crossings(x)
+            inputs = [x, mesh.device_edges, mesh.device_faces, self._pairs]
+            outputs = [self._counts, self._kept, self._status]
+            queue = self._pairs, self._counts, Count.QUEUED
+            launch_over_queue(_keep_crossings(x.dtype), *queue, inputs=inputs, outputs=outputs)
 
         retry_until_fits(launch, self, mesh.device)
         if not self._count:
@@ -253,13 +255,9 @@ class IntersectionFinder:
         (unsure,) = np.nonzero(status == UNSURE)
         if len(unsure):
             edges, faces = pairs[unsure].T
-            edges, across, faces = (
-                positions[mesh.edges[edges]],
-                positions[mesh.across[faces]],
-                positions[mesh.faces[faces]],
-            )
-            meets[unsure] = checker.edge_face_crossings(edges, faces)
-            crosses[unsure] = checker.edges_pass_faces(edges, faces, across)
+            both = positions[mesh.edges[edges]], positions[mesh.faces[faces]]
+            meets[unsure] = checker.edge_face_crossings(*both)
+            crosses[unsure] = checker.edges_pass_faces(*both, positions[mesh.across[faces]])
         pairs, crosses = pairs[meets], crosses[meets]
         order = np.lexsort((pairs[:, 1], pairs[:, 0]))
         return Intersections(pairs[order], crosses[order], self._filtered)
@@ -269,25 +267,18 @@ class IntersectionFinder:
         counts = self._counters.read()
         queued, found = counts.edge_edge.queued, counts.edge_edge.found
         self._count, self._filtered = found, counts.edge_edge.filtered
-        grows = counts.face_pairs > self._broad_phase.capacity or queued > len(self._pairs)
+        grows = counts.face_pairs > self._broad_phase.capacity or queued > len(self._pairs) or found > len(self._kept)
         self._broad_phase.grow(counts.face_pairs)
         if queued > len(self._pairs):
             capacity = capacity_for(queued, "edge-face pairs")
             self._pairs = wp.empty(capacity, dtype=wp.vec2i, device=self._pairs.device)
         if found > len(self._kept):
             self._allocate(capacity_for(found, "intersections"))
-            return True
         return grows
 
     def _allocate(self, capacity: int) -> None:
         made = (wp.empty(capacity, dtype=dtype, device=self._mesh.device) for dtype in (wp.vec2i, wp.int8))
         self._kept, self._status = made  # both or none
-
-    def _keep_crossings(self, x: wp.array) -> None:
-        inputs = [x, self._mesh.device_edges, self._mesh.device_faces, self._pairs]
-        outputs = [self._counts, self._kept, self._status]
-        kernel, pairs, counts = _keep_crossings(x.dtype), self._pairs, self._counts
-        launch_over_queue(kernel, pairs, counts, Count.QUEUED, inputs=inputs, outputs=outputs)
 
     def _pairs_that_may_meet(self, start: Intersections, collisions: Collisions) -> np.ndarray:
         """Returns the pairs (edge, face) that met at the start, or that a collision of their parts implies may meet.

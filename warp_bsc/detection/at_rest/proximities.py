@@ -120,9 +120,9 @@ class Proximities:
 class _ProximityQueue:
     """The queue of candidates of one kind, and the proximities among them."""
 
-    def __init__(self, kind: PairKind, counts: wp.array, capacity: int, device: wp.Device):
-        self.kind, self.counts, self._device = kind, counts, device
-        self.candidates = wp.empty(capacity, dtype=wp.vec2i, device=device)
+    def __init__(self, kind: PairKind, counts: wp.array, capacity: int):
+        self.kind, self.counts, self._device = kind, counts, counts.device
+        self.candidates = wp.empty(capacity, dtype=wp.vec2i, device=self._device)
         self._allocate(capacity)
         self._count = 0
 
@@ -133,14 +133,13 @@ class _ProximityQueue:
     def grow(self, queued: int, found: int) -> bool:
         """Enlarges the buffers that were too small for some counts, and returns whether any was."""
         self._count = found
-        grown = False
+        grows = queued > len(self.candidates) or found > len(self.pairs)
         if queued > len(self.candidates):
             capacity = capacity_for(queued, f"{self.kind.display_name} candidates")
-            self.candidates, grown = wp.empty(capacity, dtype=wp.vec2i, device=self._device), True
+            self.candidates = wp.empty(capacity, dtype=wp.vec2i, device=self._device)
         if found > len(self.pairs):
             self._allocate(capacity_for(found, f"{self.kind.display_name} proximities"))
-            grown = True
-        return grown
+        return grows
 
     def read(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns pairs, distances and positions, sorted by pair."""
@@ -152,9 +151,8 @@ class _ProximityQueue:
         """Keeps the candidates that are at most a distance apart, or may be."""
         inputs = [x, int(self.kind), elements, rings, wp.float64(distance), self.candidates]
         outputs = [self.counts, self.pairs, self.distance, self.position]
-        launch_over_queue(
-            _keep_proximities(x.dtype), self.candidates, self.counts, Count.QUEUED, inputs=inputs, outputs=outputs
-        )
+        queue = self.candidates, self.counts, Count.QUEUED
+        launch_over_queue(_keep_proximities(x.dtype), *queue, inputs=inputs, outputs=outputs)
 
 
 class ProximityFinder:
@@ -174,9 +172,7 @@ class ProximityFinder:
         self._broad_phase = make_broad_phase(mesh, self._counters.face_pairs)
         self._lock = self._broad_phase.lock
         elements = len(mesh.faces) + len(mesh.free_edges) + len(mesh.points)
-        self._queues = [
-            _ProximityQueue(kind, getattr(self._counters, kind.label), 2 * elements, mesh.device) for kind in PairKind
-        ]
+        self._queues = [_ProximityQueue(kind, getattr(self._counters, kind.label), 2 * elements) for kind in PairKind]
         self._rings = make_rings(mesh, rings)
 
     @one_at_a_time
@@ -315,7 +311,7 @@ def distances(points: ArrayLike | wp.array, kind: str, *, device: wp.DeviceLike 
         raise ValueError(f"points must be at most 2^1000 to have distances, not {largest:g}")
     device = checked_device(device)
     x, elements, pairs = mesh_of_rows(of_kind, points, device)
-    queue = _ProximityQueue(of_kind, wp.zeros(len(Count), dtype=wp.int64, device=device), len(points), device)
+    queue = _ProximityQueue(of_kind, wp.zeros(len(Count), dtype=wp.int64, device=device), len(points))
     queue.candidates.assign(pairs)
     queue.counts.assign(PairCounts(queued=len(points)))
     queue.launch(x, elements, Rings(), np.inf)

@@ -7,7 +7,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from ..._arguments import check_finite, check_instance, checked_choice, checked_distances, checked_flag, checked_shape
+from ..._arguments import check_finite, checked_choice, checked_distances, checked_flag, checked_shape
 from ...kernels.signs import FREE, HIT, UNSURE
 from ..narrow.contact_buffer import HostContacts, read_contacts
 from ..narrow.narrow_phase import NarrowPhase
@@ -172,25 +172,9 @@ def query_vertex_vertex(
     return _query(PairKind.VERTEX_VERTEX, points, min_distance, method, toi, tolerance, device)
 
 
-def _query_into(out, kind, points, min_distance, method, timed, tolerance, device) -> DeviceQueryResult:
-    """Decides queries whose results stay on the device."""
-    check_instance(out, "out", DeviceQueryResult, "a DeviceQueryResult")
-    if not isinstance(points, wp.array):
-        raise TypeError(f"points must be a Warp array if there is out, not {type(points).__name__}")
-    checked_choice(method, "method", METHODS)
-    if checked_flag(timed, "toi") != (out.toi is not None):
-        raise ValueError(f"toi must be {out.toi is not None}, as out was made with")
-    if device is not None and checked_device(device) != out.device:
-        raise ValueError(f"device must be that of out, {out.device}, not {device}")
-    if not isinstance(min_distance, (int, float)) or min_distance != 0.0:
-        raise ValueError("min_distance must be 0 if there is out")
-    query_into(out, kind, points, method, checked_tolerance(tolerance))
-    return out
-
-
 def _query(kind, points, min_distance, method, timed, tolerance, device, out=None) -> Any:
     if out is not None:
-        return _query_into(out, kind, points, min_distance, method, timed, tolerance, device)
+        return query_into(out, kind, points, min_distance, method, timed, tolerance, device)
     checked_choice(method, "method", METHODS)
     tolerance = checked_tolerance(tolerance)
     timed = checked_flag(timed, "toi")
@@ -210,13 +194,10 @@ def _query(kind, points, min_distance, method, timed, tolerance, device, out=Non
     counts = wp.zeros(len(Count), dtype=wp.int64, device=device)
     narrow_phase = NarrowPhase(kind, counts, n, pairs[-1] + 1 if n else (1, 1))
     narrow_phase.queue.assign(pairs)
-    all_queued = PairCounts(queued=n)
     # without a distance: the narrow phase of contacts
     contact = kind in SURFACE_KINDS and not distance.any()
-    radius = np.zeros((n, half))
-    radius[:, 0] = distance  # those of the other vertices are 0, so that the sum of two is exact
-    if kind == PairKind.EDGE_EDGE:
-        radius[:, 1] = distance
+    radius = np.zeros((n, half))  # 0 of all vertices but those of the first element, so that the sum of two is exact
+    radius[:, : 2 if kind == PairKind.EDGE_EDGE else 1] = distance.reshape(-1, 1)
     radius = radius.ravel()
     device_radius = wp.array(radius, dtype=wp.float64, device=device)
 
@@ -226,7 +207,7 @@ def _query(kind, points, min_distance, method, timed, tolerance, device, out=Non
         buffers = "exact" if method == "conservative" and timed else method
 
         def launch() -> None:
-            counts.assign(all_queued)
+            counts.assign(PairCounts(queued=n))
             options = {"method": buffers, "timed": timed, "tolerance": tolerance, "timer": PhaseTimer(None)}
             if contact:
                 run_contacts([(narrow_phase, elements)], x0, x1, **options)
@@ -245,20 +226,16 @@ def _query(kind, points, min_distance, method, timed, tolerance, device, out=Non
             decide_on_host(kind, x0, x1, elements, None if contact else radius, contacts, left, timed=timed)
         return contacts, contacts.pairs[:, 0] // (2 if kind == PairKind.EDGE_EDGE else half)
 
-    certified, certified_rows = solve("conservative" if method == "float" else method)
+    found, rows = solve("conservative" if method == "float" else method)
     status = np.zeros(n, dtype=np.int8)
-    status[certified_rows] = certified.status
-    decided, decided_rows = solve("float") if method == "float" else (certified, certified_rows)
-    found = decided.hit
-    decided_rows = decided_rows[found]
+    status[rows] = found.status
+    if method == "float":
+        found, rows = solve("float")
+    found, rows = found.rows(found.hit), rows[found.hit]
     hit = np.zeros(n, dtype=bool)
-    hit[decided_rows] = True
+    hit[rows] = True
     if not timed:
         return QueryResult(hit, status, None, None, None)
-    toi = np.full(n, 2.0)
-    coordinates = np.full((n, 3), np.nan)
-    normal = np.full((n, 3), np.nan)
-    toi[decided_rows] = decided.toi[found]
-    coordinates[decided_rows] = decided.coordinates[found]
-    normal[decided_rows] = decided.normal[found]
+    toi, coordinates, normal = np.full(n, 2.0), np.full((n, 3), np.nan), np.full((n, 3), np.nan)
+    toi[rows], coordinates[rows], normal[rows] = found.toi, found.coordinates, found.normal
     return QueryResult(hit, status, toi, coordinates, normal)

@@ -1,9 +1,11 @@
 """Results of elementary queries that stay on their device, and the buffers to find them without the host."""
 
+from typing import Any
+
 import numpy as np
 import warp as wp
 
-from ..._arguments import checked_flag, checked_integer
+from ..._arguments import check_instance, checked_choice, checked_flag, checked_integer
 from ...kernels.motion import all_finite
 from ...kernels.pipeline.queues import take_slot
 from ...kernels.signs import FREE, UNSURE
@@ -13,7 +15,7 @@ from ..narrow.rules.contact import run_contacts
 from ..run.host_function import run_on_host
 from ..run.launch import launch_over, launch_over_queue, made_once
 from ..run.phase_timer import PhaseTimer
-from ..run.settings import METHODS, NO_GRADIENTS, Count, Method, PairCounts, PairKind
+from ..run.settings import METHODS, NO_GRADIENTS, Count, Method, PairCounts, PairKind, checked_tolerance
 from ..run.start import checked_device
 from .query_points import elements_of_rows
 
@@ -197,42 +199,38 @@ class DeviceQueryResult:
         run_contacts([(narrow_phase, elements)], x, x[4:], **options)
         buffers = narrow_phase.pair_buffers(elements)
         points = 8 if kind == PairKind.VERTEX_FACE else 2
-        inputs = [buffers, points, METHODS.index(method), timed]
-        launch_over_queue(
-            _write_contacts,
-            buffers.order,
-            self._counts,
-            Count.CONTACTS,
-            inputs=inputs,
-            outputs=[self._rows, self.undecided],
-        )
+        inputs, outputs = [buffers, points, METHODS.index(method), timed], [self._rows, self.undecided]
+        queue = buffers.order, self._counts, Count.CONTACTS
+        launch_over_queue(_write_contacts, *queue, inputs=inputs, outputs=outputs)
 
 
-def query_into(out: DeviceQueryResult, kind: PairKind, points: wp.array, method: Method, tolerance: float) -> None:
+def query_into(
+    out: Any, kind: PairKind, points: Any, min_distance: Any, method: Any, timed: Any, tolerance: Any, device: Any
+) -> DeviceQueryResult:
     """Decides queries on the device of their points, or adds this to the graph that the device captures.
 
-    Args:
-        out: The results.
-        kind: The kind of query.
-        points: Positions, as of :func:`warp_bsc.query_vertex_face`, Warp array on the device of the results.
-        method: The method.
-        tolerance: Of the times of impact, as a share of the step.
-
-    Raises:
-        TypeError: If the points are not float32 or float64.
-        ValueError: If they have another shape, are elsewhere, or are not contiguous.
-        RuntimeError: If a GPU captures a graph before the first such call with these results.
+    Arguments, result and errors are those of :func:`warp_bsc.query_vertex_face` with ``out``.
     """
-    x = _vectors_of(points, out)
-    device = out.device
+    check_instance(out, "out", DeviceQueryResult, "a DeviceQueryResult")
+    if not isinstance(points, wp.array):
+        raise TypeError(f"points must be a Warp array if there is out, not {type(points).__name__}")
+    checked_choice(method, "method", METHODS)
+    if checked_flag(timed, "toi") != (out.toi is not None):
+        raise ValueError(f"toi must be {out.toi is not None}, as out was made with")
+    if device is not None and checked_device(device) != out.device:
+        raise ValueError(f"device must be that of out, {out.device}, not {device}")
+    if not isinstance(min_distance, (int, float)) or min_distance != 0.0:
+        raise ValueError("min_distance must be 0 if there is out")
+    tolerance, x = checked_tolerance(tolerance), _vectors_of(points, out)
     key: tuple[PairKind, type, Method] = (kind, x.dtype, method)
-    if device.is_cuda and device.is_capturing and key not in out._loaded:
+    if out.device.is_cuda and out.device.is_capturing and key not in out._loaded:
         raise RuntimeError(
             "query once with this out, method and type of points before capturing, so that kernels are loaded and "
             "buffers are there"
         )
-    run_on_host(lambda: out._find(kind, x, method, tolerance), device)
+    run_on_host(lambda: out._find(kind, x, method, tolerance), out.device)
     out._loaded.add(key)
+    return out
 
 
 def _vectors_of(points: wp.array, out: DeviceQueryResult) -> wp.array:

@@ -75,22 +75,20 @@ class CollisionFinder:
         generation = pipeline.generation
 
         def read() -> Collisions:
-            if generation != pipeline.generation:
-                raise RuntimeError("the detector's buffers have grown since this detection was captured: capture again")
-            counts = pipeline.counters.read()
-            overflows = tuple(pipeline.overflows(counts))
-            left_to_host = pipeline.method == "exact" and any(pairs.too_wide_8 for pairs in counts.pairs.values())
-            certified = pipeline.method != "float" and not (overflows or counts.not_finite or left_to_host)
-            for narrow_phase in pipeline.narrow_phases:
-                narrow_phase.sort()
-            contacts = self._ordered_contacts(counts, recycle=True)
-            pipeline.counts = counts
-            certified = certified and certifies(contacts)
-            return Collisions(certified, overflows, arrays, pipeline.method, counts, contacts, PhaseTimer(None))
-
-        def read_alone() -> Collisions:
             with self._lock:
-                return read()
+                if generation != pipeline.generation:
+                    why = "the detector's buffers have grown since this detection was captured"
+                    raise RuntimeError(f"{why}: capture again")
+                counts = pipeline.counters.read()
+                overflows = tuple(pipeline.overflows(counts))
+                left_to_host = pipeline.method == "exact" and any(pairs.too_wide_8 for pairs in counts.pairs.values())
+                certified = pipeline.method != "float" and not (overflows or counts.not_finite or left_to_host)
+                for narrow_phase in pipeline.narrow_phases:
+                    narrow_phase.sort()
+                contacts = self._ordered_contacts(counts, recycle=True)
+                pipeline.counts = counts
+                certified = certified and certifies(contacts)
+                return Collisions(certified, overflows, arrays, pipeline.method, counts, contacts, PhaseTimer(None))
 
         arrays = None
         if differentiable:
@@ -100,7 +98,7 @@ class CollisionFinder:
                 buffer = make_contact_buffer(capacity, self._device)
                 whole[narrow_phase.kind] = narrow_phase.ordered_contacts(capacity, buffer)
             arrays = self._differentiable(x0, x1, whole)
-        return CapturedCollisions(arrays, read_alone)
+        return CapturedCollisions(arrays, read)
 
     def check_counted_finite(self, x0: wp.array, x1: wp.array) -> None:
         """Raises a ValueError that names a vertex whose position is not finite, if the last run has counted one."""

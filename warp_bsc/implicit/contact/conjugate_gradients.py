@@ -112,12 +112,8 @@ def _make_solve_kernel(bounds: int, parts: int, kept: int, shared: bool):
     sizes = {"SHARED": int(shared), "WIDE": 4 if shared else 3, "THREADS": bounds, "PARTS": parts, "KEPT": kept}
     inverses = 9 * bounds if kept and shared and bounds == min(_KEPT) else 0
     left = _SHARED_MEMORY - 4 * (inverses + 4 * bounds) if shared else 0
-    sizes |= {
-        "INVERSES": inverses,
-        "COUPLED": max(left // _OF_CONTACT, 1),
-        "UNROLLED": 1 if shared else 4,
-        "AGAIN": _AGAIN,
-    }
+    sizes |= {"INVERSES": inverses, "COUPLED": max(left // _OF_CONTACT, 1)}
+    sizes |= {"UNROLLED": 1 if shared else 4, "AGAIN": _AGAIN}
     macros = "".join(f"#define {name} {size}\n" for name, size in sizes.items())
 
     @wp.func_native(snippet=macros + header(__file__, "solve.h"))

@@ -63,11 +63,8 @@ def elements_of_model(model: newton.Model) -> tuple[Elements, list[np.ndarray]]:
         indices = indices.reshape((-1, size))
         setattr(elements, f"{name}_indices", indices)
         vertices.append(indices.numpy().astype(np.int64))
-    elements.tri_poses, elements.tri_areas, elements.tri_materials = (
-        model.tri_poses,
-        model.tri_areas,
-        model.tri_materials,
-    )
+    for name in ("tri_poses", "tri_areas", "tri_materials"):
+        setattr(elements, name, getattr(model, name))
     elements.edge_rest_angle, elements.edge_rest_length = model.edge_rest_angle, model.edge_rest_length
     elements.edge_properties = model.edge_bending_properties
     elements.tet_poses, elements.tet_materials = model.tet_poses, model.tet_materials

@@ -239,12 +239,6 @@ class LinearSolver:
         """
         self._team.arrived.zero_()
         inputs = [matrix, b, self._of_worlds, *self._limits, wp.float64(failure), self._team]
-        wp.launch(
-            solve_worlds,
-            self._threads,
-            inputs=inputs,
-            outputs=[self._vectors, self._solution, self.failed],
-            device=self._solution.device,
-            block_dim=_BLOCK,
-        )
+        options = {"outputs": [self._vectors, self._solution, self.failed], "device": self._solution.device}
+        wp.launch(solve_worlds, self._threads, inputs=inputs, **options, block_dim=_BLOCK)
         return self._solution

@@ -268,17 +268,11 @@ class Follower:
         count = len(contacts.toi)
         if not count:
             return contacts
-        weights = wp.array(contacts.weights, dtype=wp.vec4d, device=self._device)
-        normals = wp.array(contacts.normals, dtype=wp.vec3d, device=self._device)
-        inputs = [
-            x0,
-            x1,
-            wp.array(contacts.vertices, dtype=wp.vec4i, device=self._device),
-            wp.array(contacts.are_of_edges, dtype=wp.bool, device=self._device),
-            wp.array(contacts.toi, dtype=wp.float64, device=self._device),
-            wp.array(contacts.gap, dtype=wp.float64, device=self._device),
-        ]
-        launch(find_directions, count, inputs=inputs, outputs=[weights, normals], device=self._device)
+        types = {"vertices": wp.vec4i, "are_of_edges": wp.bool, "toi": wp.float64, "gap": wp.float64}
+        types |= {"weights": wp.vec4d, "normals": wp.vec3d}
+        arrays = [wp.array(getattr(contacts, name), dtype=t, device=self._device) for name, t in types.items()]
+        *inputs, weights, normals = arrays
+        launch(find_directions, count, inputs=[x0, x1, *inputs], outputs=[weights, normals], device=self._device)
         return replace(contacts, weights=weights.numpy(), normals=normals.numpy())
 
     @functools.cached_property

@@ -127,12 +127,11 @@ class Journal:
                 line = file.readline()
                 if not line.endswith(b"\n"):
                     break
-                place = end
-                end = file.tell() + sum(32 * count for *_, count in json.loads(line)["frames"])
-                if end > size:
-                    end = place
+                stop = file.tell() + sum(32 * count for *_, count in json.loads(line)["frames"])
+                if stop > size:
                     break
-                self._places.append(place)
+                self._places.append(end)
+                end = stop
         self._file = open(self.path, "r+b", buffering=0)  # noqa: SIM115 (closed by close)
         self._file.truncate(end)  # the rest was cut by the end of the process
 

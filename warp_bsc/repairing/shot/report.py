@@ -177,9 +177,10 @@ class _Views:
             worst = max(range(count), key=lambda n: (summary.frames[n]["distortion"], summary.frames[n]["move"]))
             self.numbers.add(worst)
         most = int(np.clip(_ALL_FACES // max(1, len(self.numbers)), _FEWEST_FACES, _MOST_FACES))
-        self._faces = [
-            _faces_to_show(segment, moved, most) for segment, moved in zip(summary.segments, summary.moved, strict=True)
-        ]
+        self._faces = []  # by segment: all, or those around vertices that are moved at some time
+        for segment, moved in zip(summary.segments, summary.moved, strict=True):
+            x, lit = segment.start_positions, np.flatnonzero(moved[segment.faces].any(axis=1))
+            self._faces.append(choose_faces(x[segment.faces[:, 0]], x[moved], lit, most))
         self._number = -1
         self._meshes = {name: number for number, name in enumerate(scene.names)}
         self._center: np.ndarray | None = None
@@ -201,11 +202,8 @@ class _Views:
         step = max(float((x.max(axis=0) - low).max()) / (_STEPS - 1), np.finfo(np.float32).tiny)
         is_shown = np.isin(moved.vertices, vertices)
         rows = np.searchsorted(vertices, moved.vertices[is_shown])
-        arrays = {
-            "before": np.rint((x - low) / step).astype(np.int32),
-            "moved": rows,
-            "displacement": moved.x[is_shown] - x[rows],
-        }
+        arrays = {"before": np.rint((x - low) / step).astype(np.int32), "moved": rows}
+        arrays["displacement"] = moved.x[is_shown] - x[rows]
         facts = {"faces": self._number, "of": len(segment.faces), "low": (low - self._center).tolist(), "step": step}
         return [*texts, block(f"frame-{number}", facts, arrays)]
 
@@ -217,9 +215,8 @@ class _Views:
             notes.append(f"{len(self.numbers):,} of {count:,} moved frames have a view in 3D, spread evenly.")
         for segment, faces in zip(self._summary.segments, self._faces, strict=True):
             if len(faces) < len(segment.faces):
-                notes.append(
-                    f"The views have the {len(faces):,} of {len(segment.faces):,} triangles around what is moved."
-                )
+                shown = f"{len(faces):,} of {len(segment.faces):,}"
+                notes.append(f"The views have the {shown} triangles around what is moved.")
         return list(dict.fromkeys(notes))
 
     def _shot(self, moved: MovedFrame) -> np.ndarray:
@@ -228,12 +225,6 @@ class _Views:
         if moved.before or index == len(self._scene):
             return self._scene.interval(index - 1).x1
         return self._scene.interval(index).x0
-
-
-def _faces_to_show(segment: Segment, moved: np.ndarray, most: int) -> np.ndarray:
-    """Returns the faces that a page shows: all, or those around vertices that are moved at some time."""
-    x, lit = segment.start_positions, np.flatnonzero(moved[segment.faces].any(axis=1))
-    return choose_faces(x[segment.faces[:, 0]], x[moved], lit, most)
 
 
 def _rows(scene: Scene, findings: list[Finding]) -> list[tuple[float, float, int, int, int]]:

@@ -113,10 +113,8 @@ class StepWarnings:
         )
 
     def _of_strain(self):
-        report = self._report
-        return (
-            f"a step strained an edge by more than {float(MAX_STRAIN):.0%}{report.strain_cause}: {report.strain_advice}"
-        )
+        report, most = self._report, f"{float(MAX_STRAIN):.0%}"
+        return f"a step strained an edge by more than {most}{report.strain_cause}: {report.strain_advice}"
 
     def _of_set_bodies(self):
         labels, bodies = self._report.model.body_label, np.flatnonzero(self._report.set_steps.numpy() == SET_STEPS)

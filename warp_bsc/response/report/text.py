@@ -86,23 +86,17 @@ def line_of(report: Any) -> str:
         f"{totals.steps} steps, {totals.truncated_steps} with truncation, {totals.frozen_steps} with frozen "
         f"vertices, {totals.uncertified_steps} not certified"
     )
-    if totals.revoked_steps:
-        line += f" ({totals.revoked_steps} only in the state of the program)"
-    if totals.unseen_steps:
-        line += f", {totals.unseen_steps} whose end in the state of the program was not seen"
-    if totals.strained_steps:
-        line += f", {totals.strained_steps} that strained an edge by more than {float(MAX_STRAIN):.0%}"
-    if totals.inverting_steps:
-        line += f", {totals.inverting_steps} that inverted tetrahedra"
-    if report.crossings:
-        line += f", {report.crossings} crossings at the start of the step"
-        line += " (warp_bsc.repair_state removes those of a first step, or names them)"
-    if inside:
-        line += f", {inside} particles inside solids"
-    if totals.remaining or totals.excluded:
-        line += f"; contacts: {totals.remaining} remained, {totals.excluded} excluded"
-    if report.filtered:
-        line += f"; {report.filtered} filtered pairs in the last step, which are not certified"
-    if totals.not_finite_steps:
-        line += f", {totals.not_finite_steps} steps with positions that are not finite"
-    return line
+    removed = "(warp_bsc.repair_state removes those of a first step, or names them)"
+    contacts = f"; contacts: {totals.remaining} remained, {totals.excluded} excluded"
+    more = (
+        (totals.revoked_steps, " ({} only in the state of the program)"),
+        (totals.unseen_steps, ", {} whose end in the state of the program was not seen"),
+        (totals.strained_steps, f", {{}} that strained an edge by more than {float(MAX_STRAIN):.0%}"),
+        (totals.inverting_steps, ", {} that inverted tetrahedra"),
+        (report.crossings, f", {{}} crossings at the start of the step {removed}"),
+        (inside, ", {} particles inside solids"),
+        (totals.remaining + totals.excluded, contacts),
+        (report.filtered, "; {} filtered pairs in the last step, which are not certified"),
+        (totals.not_finite_steps, ", {} steps with positions that are not finite"),
+    )
+    return line + "".join(text.format(number) for number, text in more if number)

@@ -47,13 +47,8 @@ class ContactForces:
         columns = {name: (size, 6 if name == "of_bodies" else 3) for name, size in sizes.items()}
         self._sums = allocate(ImpulseSums, worlds, device, **columns)
         self.rows = allocate(ContactRows, capacity, device, count=1, lost=1)
-        by = {
-            "particle": particles,
-            "unpaired_particle": particles,
-            "shape": shapes,
-            "pair": pairs,
-            "max_impulse": worlds,
-        }
+        by = dict.fromkeys(("particle", "unpaired_particle"), particles)
+        by |= {"shape": shapes, "pair": pairs, "max_impulse": worlds}
         self.published = allocate(PublishedImpulses, bodies, device, **by)
         self.published.max_impulse = self._sums.largest
         self._size = max(particles, bodies, shapes, pairs)
