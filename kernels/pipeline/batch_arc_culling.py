@@ -4,7 +4,7 @@ Their chords must stay farther apart than the bounds of the deviations of both e
 :mod:`warp_bsc.kernels.arcs`. That is shown for the whole step by the plane of the pair or the direction through the
 centroids, the first two proofs of :mod:`.separation_proof`; or by directions between the closest points at a few times,
 each for the times around its own, as in the advancement of :mod:`warp_bsc.kernels.min_distance`. Bounds are theirs.
-Pairs that :mod:`.simd_query` cannot use stay open.
+Pairs that :mod:`.simd` cannot use stay open.
 """
 
 import functools
@@ -16,12 +16,11 @@ from ..pairs import ABOVE_SUM
 from ..separation_proof import INFLATED, NORMAL_ERROR, PLANE_ERROR
 from ..signs import ROUNDOFF
 from .simd import native_for_pairs
-from .simd_query import QUERY_CONSTANTS
 
 _ROUNDS = 4
 """Times at which directions are tried: the start, the end, and the middle of what remains."""
 
-_CONSTANTS = QUERY_CONSTANTS | {
+_CONSTANTS = {
     "roundoff": float(ROUNDOFF),
     "inflated": float(INFLATED),
     "normal_error": float(NORMAL_ERROR),
@@ -36,19 +35,14 @@ _CONSTANTS = QUERY_CONSTANTS | {
 
 @functools.cache
 def cull_arc_batch_of(dtype: type, vertex_face: bool) -> wp.Function:
-    """Returns the function that culls a batch of pairs on arcs, for one type of position and one kind of pair.
+    """Returns the function that culls a batch of pairs on arcs; arguments are those of :func:`.native_for_pairs`.
 
-    Args:
-        dtype: Type of a position, vec3 or vec3d.
-        vertex_face: Whether pairs are (vertex, face); otherwise (edge, edge).
-
-    Returns:
-        Device function for the CPU. Its arguments are the positions at both ends, the vertices of the elements, a queue
-        of pairs, the bounds of the deviation of each vertex over the whole step, the first pair of the batch and the
-        number of pairs in it, at most 64. It returns a bit for each pair, set where no proof decides the pair. Indices
-        are not checked.
+    It is a device function for the CPU. Its own arguments are the positions at both ends, the vertices of the elements,
+    a queue of pairs, the bounds of the deviation of each vertex over the whole step, the first pair of the batch and
+    the number of pairs in it, at most 64. It returns a bit for each pair, set where no proof decides the pair. Indices
+    are not checked.
     """
-    snippet = native_for_pairs(dtype, vertex_face, "simd_query.h", "batch_arc_culling.h", **_CONSTANTS)
+    snippet = native_for_pairs(dtype, vertex_face, "batch_arc_culling.h", **_CONSTANTS)
 
     @wp.func_native(snippet)
     def cull_arc_batch(

@@ -1,7 +1,7 @@
 """The classification of many pairs at once, in SIMD packets of eight.
 
 It is :func:`warp_bsc.kernels.classification.classify`, operation by operation, so that it finds the same statuses. It
-leaves open the few pairs whose cubic is to be split at its inflection, those that :mod:`.simd_query` cannot use,
+leaves open the few pairs whose cubic is to be split at its inflection, those that :mod:`.simd` cannot use,
 and with a roundoff of zero (method "float") those that remain unsure, whose zeros need more cases.
 """
 
@@ -12,7 +12,6 @@ import warp as wp
 from ..classification import SPLIT_ERROR, TINY
 from ..roots import ROOT_CONSTANTS
 from .simd import native_for_pairs
-from .simd_query import QUERY_CONSTANTS
 
 BATCH = wp.constant(32)
 """Pairs that one call classifies."""
@@ -20,24 +19,18 @@ BATCH = wp.constant(32)
 OPEN = wp.constant(3)
 """Stands for a status, where a pair remains open."""
 
-_CONSTANTS = QUERY_CONSTANTS | ROOT_CONSTANTS | {"split_error": float(SPLIT_ERROR), "tiny_share": float(TINY)}
+_CONSTANTS = ROOT_CONSTANTS | {"split_error": float(SPLIT_ERROR), "tiny_share": float(TINY)}
 
 
 @functools.cache
 def classify_batch_of(dtype: type, vertex_face: bool) -> wp.Function:
-    """Returns the function that classifies a batch of pairs, for one type of position and one kind of pair.
+    """Returns the function that classifies a batch of pairs; arguments are those of :func:`.native_for_pairs`.
 
-    Args:
-        dtype: Type of a position, vec3 or vec3d.
-        vertex_face: Whether pairs are (vertex, face); otherwise (edge, edge).
-
-    Returns:
-        Device function for the CPU. Its arguments are the positions at both ends, the vertices of the elements, a queue
-        of pairs, the first pair of the batch, the number of pairs in it, at most :data:`BATCH`, and the roundoff. It
-        returns two bits for each pair: its status, or :data:`OPEN`. Indices are not checked.
+    It is a device function for the CPU. Its own arguments are the positions at both ends, the vertices of the elements,
+    a queue of pairs, the first pair of the batch, the number of pairs in it, at most :data:`BATCH`, and the roundoff.
+    It returns two bits for each pair: its status, or :data:`OPEN`. Indices are not checked.
     """
-    headers = ("simd_query.h", "simd_roots.h", "batch_classification.h")
-    snippet = native_for_pairs(dtype, vertex_face, *headers, **_CONSTANTS)
+    snippet = native_for_pairs(dtype, vertex_face, "simd_roots.h", "batch_classification.h", **_CONSTANTS)
 
     @wp.func_native(snippet)
     def classify_batch(

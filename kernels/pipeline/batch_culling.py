@@ -22,7 +22,6 @@ import functools
 import warp as wp
 
 from .simd import native_for_pairs
-from .simd_query import QUERY_CONSTANTS
 
 BATCH = wp.constant(64)
 """Pairs that one call culls."""
@@ -32,20 +31,15 @@ _LARGEST = 1.0e70
 
 @functools.cache
 def cull_batch_of(dtype: type, vertex_face: bool) -> wp.Function:
-    """Returns the function that culls a batch of pairs, for one type of position and one kind of pair.
+    """Returns the function that culls a batch of pairs; arguments are those of :func:`.native_for_pairs`.
 
-    Args:
-        dtype: Type of a position, vec3 or vec3d.
-        vertex_face: Whether pairs are (vertex, face); otherwise (edge, edge).
-
-    Returns:
-        Device function for the CPU. Its arguments are the positions at both ends, the vertices of the elements, a queue
-        of pairs, the first of the batch, their number, at most :data:`BATCH`, whether boxes are known to meet, and the
-        roundoff. It returns a bit for each pair, set where no cull decides it. Indices are not checked.
+    It is a device function for the CPU. Its own arguments are the positions at both ends, the vertices of the elements,
+    a queue of pairs, the first of the batch, their number, at most :data:`BATCH`, whether boxes are known to meet, and
+    the roundoff. It returns a bit for each pair, set where no cull decides it. Indices are not checked.
     """
     flushed = 40.0 * 2.0 ** (-126 if dtype is wp.vec3 else -1022)
-    constants = QUERY_CONSTANTS | {"batch": int(BATCH), "largest_size": _LARGEST, "flushed": flushed}
-    snippet = native_for_pairs(dtype, vertex_face, "simd_query.h", "batch_culling.h", **constants)
+    constants = {"batch": int(BATCH), "largest_size": _LARGEST, "flushed": flushed}
+    snippet = native_for_pairs(dtype, vertex_face, "batch_culling.h", **constants)
 
     @wp.func_native(snippet)
     def cull_batch(

@@ -2,7 +2,7 @@
 
 It is :func:`warp_bsc.kernels.time_of_impact.impact`, operation by operation, so that it finds the same bits. A pair
 whose search ends makes room for the next one of the batch, so that no lane waits for a harder neighbour. Pairs that
-:mod:`.simd_query` cannot use stay open.
+:mod:`.simd` cannot use stay open.
 
 **Touching.** Without times the search is omitted for features that certainly touch, but nowhere with strict signs: no
 search could certify a hit, nor that they are free, so that they remain UNSURE. Obstacles along the axes make them
@@ -22,38 +22,27 @@ from ..roots import ROOT_CONSTANTS
 from ..signs import FREE, HIT, UNSURE
 from ..time_of_impact import SEARCH_CONSTANTS
 from .simd import native_for_pairs
-from .simd_query import QUERY_CONSTANTS
 
 BATCH = wp.constant(64)
 """Pairs that one call decides."""
 
-_CONSTANTS = (
-    QUERY_CONSTANTS
-    | ROOT_CONSTANTS
-    | SEARCH_CONSTANTS
-    | {"flat": float(FLAT), "batch": int(BATCH), "FREE": int(FREE), "HIT": int(HIT), "UNSURE": int(UNSURE)}
-)
+_CONSTANTS = ROOT_CONSTANTS | SEARCH_CONSTANTS | {"flat": float(FLAT), "batch": int(BATCH)}
+_CONSTANTS |= {"FREE": int(FREE), "HIT": int(HIT), "UNSURE": int(UNSURE)}
 
 
 @functools.cache
 def impact_batch_of(dtype: type, vertex_face: bool) -> wp.Function:
-    """Returns the function that finds the impacts of a batch of pairs, for one type of position and one kind of pair.
+    """Returns the function that finds the impacts of a batch; arguments are those of :func:`.native_for_pairs`.
 
-    Args:
-        dtype: Type of a position, vec3 or vec3d.
-        vertex_face: Whether pairs are (vertex, face); otherwise (edge, edge).
-
-    Returns:
-        Device function for the CPU. Its arguments are the positions at both ends, the vertices of the elements, an
-        array of pairs, the first pair of the batch, the number of pairs in it, at most :data:`BATCH`, the roundoff,
-        whether times are needed, the largest power of two that is at most the tolerance, and the arrays that it changes
-        in the rows of the pairs: statuses by classification, HIT or UNSURE, and if times are needed whether they are
-        within the tolerance, the times, and the coordinates and normals of those that are not FREE. Without times it
-        only decides what is UNSURE. It returns two sets of pairs, as bits: those that remain open, and those that are
-        touching. Indices are not checked.
+    It is a device function for the CPU. Its own arguments are the positions at both ends, the vertices of the elements,
+    an array of pairs, the first pair of the batch, the number of pairs in it, at most :data:`BATCH`, the roundoff,
+    whether times are needed, the largest power of two that is at most the tolerance, and the arrays that it changes in
+    the rows of the pairs: statuses by classification, HIT or UNSURE, and if times are needed whether they are within
+    the tolerance, the times, and the coordinates and normals of those that are not FREE. Without times it only decides
+    what is UNSURE. It returns two sets of pairs, as bits: those that remain open, and those that are touching. Indices
+    are not checked.
     """
-    headers = ("simd_query.h", "simd_roots.h", "append.h", "batch_impacts.h")
-    snippet = native_for_pairs(dtype, vertex_face, *headers, **_CONSTANTS)
+    snippet = native_for_pairs(dtype, vertex_face, "simd_roots.h", "append.h", "batch_impacts.h", **_CONSTANTS)
 
     @wp.func_native(snippet)
     def impact_batch(

@@ -13,7 +13,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from .._one_thread import one_at_a_time
 from ..detection.arcs.rigid_motion import RigidMotion
 from ..detection.at_rest.containment import ContainmentFinder
 from ..detection.at_rest.intersections import Intersections
@@ -289,7 +288,7 @@ class _SegmentNamer:
     def __init__(self, segment: Segment, detector: _SegmentDetector, checks: Checks):
         self.segment = segment
         self._checks = checks
-        self._lock = threading.RLock()
+        self._lock = threading.Lock()  # intervals share their times, which are named once
         self._mesh = detector.mesh
         self._strand_mesh = detector.strands.mesh if detector.strands else None
         bodies = detector.strands.bodies if detector.strands else segment.face_meshes
@@ -305,7 +304,8 @@ class _SegmentNamer:
         intervals, collisions, arcs = detection.intervals, detection.collisions, detection.arcs
         selection = self._checks.selection
         moments, nothing = detection.moments, [None] * len(intervals)
-        self.name_at([moment for both in moments for moment in both])
+        with self._lock:
+            self.name_at([moment for both in moments for moment in both])
         at_rest = [(a.intersections, b.intersections) for a, b in moments] if self._checks.intersections else nothing
         near = [(a.proximities, b.proximities) for a, b in moments] if self._checks.clearance is not None else nothing
         contacts = find_contacts(intervals, detection.detector.mesh, collisions, selection, arcs)
@@ -344,7 +344,6 @@ class _SegmentNamer:
             results.append(IntervalResult(summary, found, at_rest[number], near[number], None))
         return results
 
-    @one_at_a_time
     def name_at(self, moments: Iterable[_Moment]) -> None:
         """Names the intersections, with the parts inside meshes, and the proximities of some times, once."""
         selection, meshes = self._checks.selection, self.segment.meshes
