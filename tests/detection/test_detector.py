@@ -283,6 +283,22 @@ def test_capacities_for_a_number_of_pairs_a_face(n):
     assert pipeline.counts == other.counts
 
 
+def test_large_meshes_begin_with_room_for_fewer_contacts(monkeypatch):
+    """Half as many survivors and contacts a face, from a number of pairs on; all are found, as queues grow."""
+    x0, x1, faces = crumpled(0, 48)
+    mesh, found = bsc.CollisionMesh(faces, len(x0)), []
+    for many in (2**22, 1000):
+        monkeypatch.setattr("warp_bsc.detection.narrow.narrow_phase._MANY", many)
+        pipeline = DetectionPipeline(mesh)
+        found.append([(n.capacities.survivors, n.capacities.contacts) for n in pipeline.narrow_phases])
+        finder = CollisionFinder(pipeline, pipeline.broad_phase.lock)
+        found[-1].append(finder.find(*(wp.array(x, dtype=wp.vec3, device=mesh.device) for x in (x0, x1))).earliest_toi)
+    vertex_face, edge_edge = len(faces) // 2 + 1, 2 * len(faces)
+    assert found[0][:2] == [(n // 2 + 64, n // 8 + 64) for n in (vertex_face, edge_edge)]
+    assert found[1][:2] == [(n // 4 + 64, n // 16 + 64) for n in (vertex_face, edge_edge)]
+    assert found[0][2] == found[1][2]
+
+
 def found_pairs(narrow_phases):
     """What a detection that was not sorted found, as a set for each kind."""
     found = []
