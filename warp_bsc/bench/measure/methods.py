@@ -310,15 +310,15 @@ class MethodRun:
         """Returns the status of each query after a launch: FREE, HIT or UNSURE, int8, shape [n]; not if repeated."""
         if self.method not in NARROW_PHASE_METHODS:
             return self._status.numpy().copy()
-        status = np.full(self.queries.count, FREE, dtype=np.int8)
-        contacts = self._narrow_phase.contacts
+        status, contacts = np.full(self.queries.count, FREE, dtype=np.int8), self._narrow_phase.contacts
+        found = contacts.decided if self.method == "exact" else contacts.status
         count = int(self._counts.numpy()[Count.CONTACTS])
         keys, of_contacts = (
             np.ascontiguousarray(pairs, dtype=np.int32).view(np.int64)[:, 0]
             for pairs in (self.queries.pairs, contacts.pairs.numpy()[:count])
         )
         order = np.argsort(keys)
-        status[order[np.searchsorted(keys, of_contacts, sorter=order)]] = contacts.decided.numpy()[:count]
+        status[order[np.searchsorted(keys, of_contacts, sorter=order)]] = found.numpy()[:count]
         return status
 
     def find_hits(self) -> np.ndarray:
