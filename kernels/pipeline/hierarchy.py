@@ -73,14 +73,14 @@ def _min_of_warp(x: wp.vec3) -> wp.vec3:
 @wp.func_native(
     snippet="""
 #if defined(__CUDA_ARCH__)
-    return __ballot_sync(0xffffffffu, flag != 0) != 0;
+    return (__ballot_sync(0xffffffffu, flags & 1) != 0) | (__ballot_sync(0xffffffffu, flags & 2) != 0) << 1;
 #else
-    return flag != 0;
+    return flags;
 #endif
 """
 )
-def _any_of_warp(flag: int) -> int:
-    """Returns whether any thread of a warp has a flag, as 0 or 1; on the CPU whether the thread has."""
+def _flags_of_warp(flags: int) -> int:
+    """Returns the two flags that any thread of a warp has; on the CPU those of the thread."""
     ...
 
 
@@ -114,6 +114,8 @@ def count_set_bits(bits: wp.uint32) -> int:
 
 _ABOVE = wp.constant(wp.uint32((1 << 9) | (1 << 19) | (1 << 29)))
 """The bits above three coordinates of 9 bits."""
+SOUGHT = wp.constant(3)
+"""The flags of two faces together whose pair is sought: one has changed, 1, and one is paired with all others, 2."""
 NOWHERE = wp.constant(wp.uint32(511 | (511 << 10) | (511 << 20)))
 """Each row of the coded box of nothing, which is apart from all."""
 
@@ -125,37 +127,31 @@ class HierarchyLevel:
     Attributes:
         boxes: Box of each node, shape [n, 4], with lowest coordinates higher than the highest where there is no face;
             no array for faces, whose boxes are :attr:`coded`.
-        changed: Nonzero where a face has pairs that are sought; no array likewise.
+        flags: Those that a face of it has, see :data:`SOUGHT`; no array likewise.
         coded: Box of each face in that of its cluster, see :func:`coded_box`, shape [n, 4]; no array for other levels.
         first_world: Lowest world of the faces below; no array if all faces are in one world.
         last_world: Highest world of the faces below.
     """
 
     boxes: wp.array2d[wp.vec3]
-    changed: wp.array[int]
+    flags: wp.array[int]
     coded: wp.array2d[wp.uint32]
     first_world: wp.array[int]
     last_world: wp.array[int]
 
 
 @wp.func
-def is_idle(child: int) -> bool:
-    """Returns whether a thread has nothing to do for its child: on the CPU, where that of the first does it all."""
-    return child_step() == 1 and child % WIDTH != 0
-
-
-@wp.func
-def write_node(level: HierarchyLevel, node: int, box: BoxRows, changed: int):
+def write_node(level: HierarchyLevel, node: int, box: BoxRows, flags: int):
     """Writes a node, from what the threads of a warp know of its children, and returns its box."""
     low0 = _min_of_warp(box[0])
     high0 = -_min_of_warp(-box[1])
     low1 = _min_of_warp(box[2])
     high1 = -_min_of_warp(-box[3])
     of_node = wp.matrix_from_rows(low0, high0, low1, high1)
-    any_changed = _any_of_warp(changed)
+    of_any = _flags_of_warp(flags)
     if first_child() == 0:
         write_box(of_node, level.boxes, node)
-        level.changed[node] = any_changed
+        level.flags[node] = of_any
     return of_node
 
 
@@ -250,15 +246,14 @@ def same_world(level: HierarchyLevel, i: int, other_level: HierarchyLevel, j: in
 def unseparated_children(clusters: HierarchyLevel, cluster: int, box: BoxRows, level: HierarchyLevel, first: int):
     """Returns which of 32 nodes of a level, from the first on, no axis separates from a cluster with a box, as bits.
 
-    Nodes in other worlds are left out, as are nodes without a change if the cluster has none.
+    Nodes in other worlds are left out, as are nodes with no face whose pairs with those of the cluster are sought.
     """
     found = wp.uint32(0)
-    changed = clusters.changed[cluster]
     count = wp.min(WIDTH, level.boxes.shape[0] - first)
     for child in range(first_child(), count, child_step()):
         node = first + child
         if not are_apart(box, read_box(level.boxes, node)):
-            if (changed | level.changed[node]) != 0 and same_world(clusters, cluster, level, node):
+            if (clusters.flags[cluster] | level.flags[node]) == SOUGHT and same_world(clusters, cluster, level, node):
                 found = found | (wp.uint32(1) << wp.uint32(child))
     return union_of_warp(found)
 
@@ -267,3 +262,9 @@ def unseparated_children(clusters: HierarchyLevel, cluster: int, box: BoxRows, l
 def bits_from(first: int):
     """Returns the bits from one on, in [0, 31]."""
     return ~((wp.uint32(1) << wp.uint32(first)) - wp.uint32(1))
+
+
+@wp.func
+def completing(flags: int, changed: wp.uint32, paired: wp.uint32) -> wp.uint32:
+    """Returns which children have the flags that are missing, as bits, given which have changed and are paired."""
+    return wp.where(flags & 1 != 0, ~wp.uint32(0), changed) & wp.where(flags & 2 != 0, ~wp.uint32(0), paired)

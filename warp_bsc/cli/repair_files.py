@@ -82,10 +82,10 @@ def repair_files(frames: Frames, arguments: argparse.Namespace, selection: Selec
             files.append(OutputFile(output))  # fails before anything is repaired
             stack.callback(files[-1].discard)
         of_vertices = {"fixed": kept[scene.file_of], "rigid": np.where(are_rigid[scene.file_of], pieces, -1)}
-        of_vertices["order"] = scene.file_of if arguments.order else None
+        order, x_previous = scene.file_of if arguments.order else None, previous.x if previous else None
         limits = {name: getattr(arguments, name) for name in ("min_distance", "max_strain")}
         with loading_kernels(device):
-            result = repair(mesh, scene.x, **of_vertices, x_previous=previous.x if previous else None, **limits)
+            result = repair(mesh, scene.x, **of_vertices, order=order, x_previous=x_previous, **limits)
         xs = scene.of_files(np.asarray(result.x))
         contents = map(MeshFile.with_positions, scene.files, xs)
         for file, data in zip(files, itertools.compress(contents, ~kept), strict=True):

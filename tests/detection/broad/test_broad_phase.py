@@ -467,3 +467,36 @@ def test_a_hilbert_curve_goes_from_each_cell_to_one_beside_it(corner, device):
     order = np.argsort(codes)
     np.testing.assert_array_equal(codes[order], codes.min() + np.arange(len(cells)))
     assert (np.abs(np.diff(cells[order], axis=0)).sum(axis=1) == 1).all()
+
+
+@pytest.mark.parametrize("only_free", [False, True])
+def test_pairs_of_strands_and_faces_of_which_one_has_changed(device, only_free):
+    """Both broad phases seek those of a face that has changed with a rope or a point that has not."""
+    random, seen = np.random.default_rng(0), 0
+    for _ in range(40):
+        counts = random.integers(0, 4, 3)
+        ends = np.cumsum(counts * [3, 2, 1])
+        vertices = random.permutation(ends[-1] + 1)
+        faces, edges, points, _ = np.split(vertices, ends)
+        x0 = random.normal(size=(len(vertices), 3))
+        positions = x0, x0 + 0.3 * random.normal(size=x0.shape)
+        changed = random.integers(0, 2, len(vertices)).astype(np.int32)
+        found = []
+        for broad_phase, of in ((BroadPhaseSimd, wp.get_device("cpu")), (BroadPhaseHierarchy, device)):
+            strands = {"edges": edges.reshape(-1, 2), "points": points, "only_free": only_free}
+            mesh = bsc.CollisionMesh(faces.reshape(-1, 3), len(vertices), **strands, device=of)
+            padding = wp.full(len(vertices), 0.1, dtype=wp.float64, device=of)
+            finder = broad_phase(mesh, wp.zeros(1, dtype=wp.int64, device=of), padding=padding)
+            finder.grow(10_000)
+            queues = [
+                wp.zeros((4, len(Count)), dtype=wp.int64, device=of),
+                wp.empty((4, 2000), dtype=wp.vec2i, device=of),
+            ]
+            out = [queue[k] for k in range(4) for queue in queues]
+            given = [wp.array(x, dtype=wp.vec3d, device=of) for x in positions]
+            finder.pair_elements(*given, *out, changed=wp.array(changed, dtype=int, device=of))
+            counted, pairs = (queue.numpy() for queue in queues)
+            found.append([(k, *pair) for k in range(4) for pair in pairs[k, : counted[k, Count.QUEUED]].tolist()])
+        assert set(found[0]) <= set(found[1]) and len(set(found[1])) == len(found[1])
+        seen += len(found[0])
+    assert seen > 200

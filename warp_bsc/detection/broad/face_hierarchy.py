@@ -32,6 +32,7 @@ from ...kernels.pipeline.corners import (
 )
 from ...kernels.pipeline.hierarchy import (
     NOWHERE,
+    SOUGHT,
     WIDTH,
     HierarchyLevel,
     bits_from,
@@ -39,8 +40,8 @@ from ...kernels.pipeline.hierarchy import (
     code_of_child,
     coded_box,
     codes_apart,
+    completing,
     first_child,
-    is_idle,
     lowest_set_bit,
     read_coded,
     same_world,
@@ -56,8 +57,8 @@ from ..run.settings import NO_GRADIENTS
 FEW_NODES = 8
 """Nodes of a level above the clusters up to which all are traversed: their boxes would take longer than they save."""
 
-_SOUGHT = wp.constant(wp.uint32(1 << 31))
-"""Bit of the first number of a face's coded box: whether pairs of the face are sought."""
+_FLAGS = wp.constant(wp.uint32(30))
+"""Place of a face's flags in the first number of its coded box."""
 
 
 @wp.struct
@@ -159,13 +160,17 @@ def _padded_box_at(mesh: FaceHierarchy, place: int) -> BoxRows:
 
 
 @wp.func
-def _is_sought(mesh: FaceHierarchy, changed: wp.array[int], cell: int, vertices: wp.vec4i) -> bool:
-    """Returns whether pairs of a cell are sought."""
-    if cell < 0 or (mesh.only_free and cell < mesh.face_count):
-        return False
+def _flags_of(mesh: FaceHierarchy, changed: wp.array[int], cell: int, vertices: wp.vec4i) -> int:
+    """Returns the flags of a cell: where pairs of two faces are left out, faces are not paired with all others."""
+    flags = int(SOUGHT)
+    if cell < 0:
+        return 0
+    if mesh.only_free and cell < mesh.face_count:
+        flags = 1
     if changed:
-        return (changed[vertices[0]] | changed[vertices[1]] | changed[vertices[2]]) != 0
-    return True
+        if (changed[vertices[0]] | changed[vertices[1]] | changed[vertices[2]]) == 0:
+            flags = flags & 2
+    return flags
 
 
 @made_once
@@ -189,12 +194,12 @@ def fit_kernel(dtype: type, padded: bool) -> wp.Kernel:
         mesh: FaceHierarchy,
     ):
         i = wp.tid()
-        if is_idle(i):
+        if child_step() == 1 and i % WIDTH != 0:  # on a CPU the first thread of 32 does it all
             return
         first = i - i % WIDTH
         box = empty_box()
         united = empty_box()
-        any_sought = int(0)
+        flags = int(0)
         for place in range(first + first_child(), first + WIDTH, child_step()):
             cell = read_cell(mesh.faces, place)
             if wp.static(padded):
@@ -205,17 +210,16 @@ def fit_kernel(dtype: type, padded: bool) -> wp.Kernel:
                 write_padded_corners(mesh.corners, place, corners)
             box = box_at(mesh, place)
             united = union_of_boxes(united, box)
-            if _is_sought(mesh, changed, mesh.order[place], cell):
-                any_sought = 1
-        cluster_box = write_node(mesh.clusters, i / WIDTH, united, any_sought)
+            flags = flags | _flags_of(mesh, changed, mesh.order[place], cell)
+        cluster_box = write_node(mesh.clusters, i / WIDTH, united, flags)
         for place in range(first + first_child(), first + WIDTH, child_step()):
             if child_step() == 1:
                 box = box_at(mesh, place)
             coded = coded_box(box, cluster_box)
             if box[0][0] > box[1][0]:
                 coded = wp.vec4ui(NOWHERE)
-            if _is_sought(mesh, changed, mesh.order[place], read_cell(mesh.faces, place)):
-                coded[0] = coded[0] | _SOUGHT
+            flags = _flags_of(mesh, changed, mesh.order[place], read_cell(mesh.faces, place))
+            coded[0] = coded[0] | (wp.uint32(flags) << _FLAGS)
             for row in range(4):
                 mesh.places.coded[place, row] = coded[row]
 
@@ -231,15 +235,15 @@ def box_parents(
 ):
     """Boxes bundles or groups."""
     i = wp.tid()
-    if is_idle(i):
+    if child_step() == 1 and i % WIDTH != 0:  # on a CPU the first thread of 32 does it all
         return
     box = empty_box()
-    changed = int(0)
+    flags = int(0)
     first = i - i % WIDTH
     for child in range(first + first_child(), wp.min(first + WIDTH, children.boxes.shape[0]), child_step()):
         box = union_of_boxes(box, read_box(children.boxes, child))
-        changed = changed | children.changed[child]
-    write_node(parents, i / WIDTH, box, changed)
+        flags = flags | children.flags[child]
+    write_node(parents, i / WIDTH, box, flags)
 
 
 @wp.func
@@ -286,23 +290,23 @@ def traversal_kernel(visit: Callable, arguments_type: type, padded: bool, **modu
         coded_cluster = coded_box(cluster_box, node)
         coded = wp.vec4ui()
         near = wp.uint32(0)
-        sought = wp.uint32(0)
+        changed = wp.uint32(0)
+        paired = wp.uint32(0)
         for child in range(first_child(), WIDTH, child_step()):
             coded = read_coded(mesh.places.coded, first + child)
             bit = wp.uint32(1) << wp.uint32(child)
             if not codes_apart(coded_cluster, coded):
                 if same_world(mesh.clusters, cluster, mesh.places, first + child):
                     near = near | bit
-            if (coded[0] & _SOUGHT) != wp.uint32(0):
-                sought = sought | bit
-        left = union_of_warp(near)
-        sought = union_of_warp(sought)
-        if mesh.clusters.changed[cluster] == 0:
-            left = left & sought
+            flags = int(coded[0] >> _FLAGS)
+            changed = changed | wp.where(flags & 1 != 0, bit, wp.uint32(0))
+            paired = paired | wp.where(flags & 2 != 0, bit, wp.uint32(0))
+        changed = union_of_warp(changed)
+        paired = union_of_warp(paired)
+        left = union_of_warp(near) & completing(mesh.clusters.flags[cluster], changed, paired)
         if left == wp.uint32(0):
             return
-        if (mesh.places.coded[place, 0] & _SOUGHT) != wp.uint32(0):
-            sought = left
+        sought = completing(int(mesh.places.coded[place, 0] >> _FLAGS), changed, paired)
         if first <= place:
             own = wp.uint32(1) << wp.uint32(place - first)
             sought = sought & ~(own | (own - wp.uint32(1)))
@@ -365,7 +369,7 @@ def _level(count: int, worlds: np.ndarray | None, device: wp.Device, *, of_faces
         level.coded = wp.empty((count, 4), dtype=wp.uint32, device=device)
     else:
         level.boxes = wp.empty((count, 4), dtype=wp.vec3, device=device)
-        level.changed = wp.zeros(count, dtype=int, device=device)
+        level.flags = wp.zeros(count, dtype=int, device=device)
     if worlds is not None:
         level.first_world, level.last_world = (wp.array(w.astype(np.int32), dtype=int, device=device) for w in worlds)
     return level
