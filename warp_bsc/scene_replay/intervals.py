@@ -73,8 +73,8 @@ def replay(
 
     Yields:
         IntervalResult: The collisions of one interval, in order, the same for any number of workers. Only the results
-        that the caller keeps stay in memory, and from other processes at most two chunks of 16 intervals for each.
-        Meanwhile the next intervals are read, and on a CPU detected; of small meshes, some at once.
+        that the caller keeps stay in memory, five that are ready early, and from other processes at most two chunks of
+        16 intervals for each. Meanwhile the next intervals are read and detected; of small meshes, some at once.
 
     Raises:
         TypeError: If an argument has another type; all errors in arguments are raised at the call.
