@@ -181,7 +181,7 @@ class BroadPhaseHierarchy:
         keep_separated: bool = False,
         *launches: tuple[Callable[[bool, bool], wp.Kernel], Sequence[wp.array]],
     ) -> None:
-        """Enqueues the pairs of faces that no axis separates, or all whose swept boxes overlap, each once.
+        """Enqueues the pairs of faces that no axis separates and few others, or all whose swept boxes overlap.
 
         Those of each part of a large mesh take the place of those of the part before, once kernels have gone over them:
         functions that make a kernel for boxes with a padding or without, swept or not, and its counts and queues.

@@ -256,7 +256,7 @@ def _nodes_to_visit(clusters: HierarchyLevel, cluster: int, box: BoxRows, level:
 
 @made_once
 def traversal_kernel(visit: Callable, arguments_type: type, padded: bool, **module_options: int) -> wp.Kernel:
-    """Returns a kernel that visits the pairs of faces whose boxes no axis separates at both ends, each pair once.
+    """Returns a kernel that visits the pairs of faces whose coded boxes no axis separates at both ends, each pair once.
 
     Its parameters are a :class:`FaceHierarchy`, the first cluster, the warps of a cluster and the arguments; launch it
     with :meth:`BroadPhaseHierarchy.traverse`. The boxes must have been fitted.
