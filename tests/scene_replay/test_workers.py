@@ -270,6 +270,35 @@ def test_a_call_that_kills_every_worker(tmp_path):
             next(answers)
 
 
+def in_worker(*lines):
+    """The arguments of a call that runs lines of Python in a worker."""
+    return exec, "\n".join(("import os, time", "from warp_bsc.scene_replay import worker", *lines))
+
+
+def test_what_a_worker_has_sent_is_there_before_it_ends_and_after(tmp_path):
+    """Also if it dies between two messages; what has not come whole has not come."""
+    told = tmp_path / "told"
+    with closing(workers.LocalWorkers(1)) as processes:
+        call = in_worker(
+            "large = bytes(range(256)) * 100_000",
+            "worker.send(worker._starter, large)",
+            "deadline = time.monotonic() + 30",
+            f"while not os.path.exists({str(told)!r}): time.sleep(0.01 if time.monotonic() < deadline else -1)",
+            "worker.send(worker._starter, b'second')",
+            "worker._starter.sendall(len(large).to_bytes(8, 'little') + large[:1000])",
+            "os._exit(1)",
+        )
+        messages = processes.result(processes.submit(*call))
+        assert next(messages) == bytes(range(256)) * 100_000
+        told.touch()
+        assert list(messages) == [b"second"]
+        with pytest.raises(ChildProcessError):
+            processes.result(processes.submit(*in_worker("worker._starter.sendall(bytes(4))", "os._exit(1)")))
+        with pytest.raises(RuntimeError, match="ZeroDivisionError"):
+            processes.result(processes.submit(*in_worker("1 / 0")))
+        assert processes.result(processes.submit(abs, -1)) == 1
+
+
 def children_of(pid):
     """Processes that check intervals for a process."""
     found = []

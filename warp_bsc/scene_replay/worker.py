@@ -9,9 +9,8 @@ import signal
 import socket
 import threading
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +31,9 @@ _ONE_CHUNK = threading.Lock()
 
 _local: tuple[int, int] | None = None
 """Number of this worker and number of all workers on this machine, None in a worker of Dask."""
+
+_starter: socket.socket | None = None
+"""The connection to the process that has started this worker, None in a worker of Dask."""
 
 
 @dataclass
@@ -78,20 +80,24 @@ def device_of_worker(name: str | None, number: int, gpu_count: int) -> str | Non
     return names[number % len(names)]
 
 
-def serve(connection: Connection, number: int, count: int) -> None:
-    """Runs a local worker: calls the functions that it receives through a connection until that is closed."""
-    global _local  # noqa: PLW0603 (one for the process)
-    _local = number, count
+def serve(connection: socket.socket, number: int, count: int) -> None:
+    """Runs a local worker: calls the functions that it receives through a connection until that is closed.
+
+    A function may send messages. An empty one follows, then what the function returns, and the error that it raises.
+    """
+    global _local, _starter
+    _local, _starter = (number, count), connection
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the first one ends the others
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    with contextlib.suppress(EOFError):
+    with contextlib.suppress(EOFError, OSError):
         while True:
-            function, arguments = connection.recv()
+            function, arguments = pickle.loads(receive(connection))
             try:
                 reply = function(*arguments), None
             except Exception as error:
                 reply = None, _portable(error)
-            connection.send(reply)
+            send(connection, b"")
+            send(connection, pickle.dumps(reply))
 
 
 def _end_with_parent() -> None:
@@ -101,15 +107,25 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def check_chunk(job: bytes, first: int, stop: int) -> bytes:
-    """Checks intervals and returns the results, and the error that stopped them, pickled for :func:`unpack`.
+def check_chunk(job: bytes, first: int, stop: int) -> list[bytes]:
+    """Checks intervals and returns each result, and the error that stopped them, pickled for :func:`unpack`.
 
-    After :data:`_CHUNK_SECONDS` no more intervals are read, so that the last ones may be missing; the first one never
-    is.
+    A local worker sends each as soon as it is there, and returns none. After :data:`_CHUNK_SECONDS` no more intervals
+    are read, so that the last ones may be missing; the first one never is.
     """
     global _opened  # noqa: PLW0603
-    stream = io.BytesIO()
+    stream, parts = io.BytesIO(), []
     pickler = _Pickler(stream, pickle.HIGHEST_PROTOCOL)
+
+    def hand_over(index: int, notes: ReadingNotes, result: IntervalResult | Exception) -> None:
+        pickler.index = index
+        stream.seek(0)  # new memory for each would take longer than to pickle it
+        pickler.dump((index, notes))
+        pickler.dump(result)
+        stream.truncate()
+        with stream.getbuffer() as part:
+            send(_starter, part) if _starter else parts.append(bytes(part))
+
     with _ONE_CHUNK:
         checker = None
         try:
@@ -118,19 +134,16 @@ def check_chunk(job: bytes, first: int, stop: int) -> bytes:
             with cores(_core_count()):
                 for result in checker.check(first, stop, _CHUNK_SECONDS):
                     checker.scene.files.check()
-                    pickler.index = result.summary.index
-                    opened.stop = max(opened.stop, pickler.index + 1)
-                    pickler.dump((pickler.index, result.contacts.interval.notes))
-                    pickler.dump(result)
+                    index = result.summary.index
+                    opened.stop = max(opened.stop, index + 1)
+                    hand_over(index, result.contacts.interval.notes, result)
         except Exception as raised:
             _opened = None
-            pickler.dump((first, checker.scene.take_notes() if checker else ReadingNotes()))
-            pickler.dump(_portable(raised))
-        pickler.dump(None)
-    return stream.getvalue()
+            hand_over(first, checker.scene.take_notes() if checker else ReadingNotes(), _portable(raised))
+    return parts
 
 
-def find_selection_without_initial(job: bytes) -> Selection:
+def selection_without_initial(job: bytes) -> Selection:
     """Returns the selection that also ignores the pairs that cross, or are inside each other, at the first time."""
     try:
         with _ONE_CHUNK, cores(_core_count()):
@@ -221,12 +234,35 @@ class _Unpickler(pickle.Unpickler):
         return self._scene.segment(pid)
 
 
-def unpack(scene: Scene, found: bytes) -> Iterator[IntervalResult]:
+def unpack(scene: Scene, parts: Iterable[bytes]) -> Iterator[IntervalResult]:
     """Yields the results of a chunk, records the scene's reading notes, and raises the error that stopped the chunk."""
-    unpickler = _Unpickler(io.BytesIO(found), scene)  # one for all, as consecutive intervals share objects
-    while notes := unpickler.load():
-        scene.note(*notes)
+    stream = io.BytesIO()
+    unpickler = _Unpickler(stream, scene)  # one for all, as consecutive intervals share objects
+    for part in parts:
+        stream.__init__(part)  # makes no copy
+        scene.note(*unpickler.load())
         result = unpickler.load()
         if isinstance(result, Exception):
             raise result
         yield result
+
+
+def send(connection: socket.socket, message: bytes | memoryview) -> None:
+    """Sends bytes that :func:`receive` returns."""
+    connection.sendall(len(message).to_bytes(8, "little"))
+    connection.sendall(message)
+
+
+def receive(connection: socket.socket, size: int | None = None) -> bytes:
+    """Returns what :func:`send` has sent, or so many bytes; raises an EOFError or OSError if the sender has ended.
+
+    (A ``multiprocessing.Connection`` would take 0.2 MB at a time, and wait for Python's lock each time.)
+    """
+    size = int.from_bytes(receive(connection, 8), "little") if size is None else size
+    message = b""
+    while len(message) < size:  # usually once
+        more = connection.recv(size - len(message), socket.MSG_WAITALL)
+        if not more:
+            raise EOFError
+        message += more
+    return message

@@ -12,7 +12,9 @@ import contextlib
 import itertools
 import logging
 import multiprocessing
+import pickle
 import signal
+import socket
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -20,9 +22,10 @@ from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import islice
 from multiprocessing import resource_tracker
-from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
+from queue import SimpleQueue
 from typing import Any
+from weakref import WeakKeyDictionary
 
 from .._arguments import checked_integer, given
 from ..detection.run.start import device_names
@@ -30,7 +33,7 @@ from ..usd.scene import Scene
 from ..usd.selection import Selection
 from .checking import Checks
 from .results import IntervalResult
-from .worker import check_chunk, find_selection_without_initial, name_device, pack, prepare, serve, unpack
+from .worker import check_chunk, name_device, pack, prepare, receive, selection_without_initial, send, serve, unpack
 
 _CHUNK_BYTES = 512 << 20  # of positions that a worker sends at a time
 _MOST_INTERVALS = 16  # in a chunk; each chunk reads and checks one time more than it has intervals
@@ -41,8 +44,8 @@ _CONNECT_SECONDS = 10.0
 class LocalWorkers:
     """Processes on this machine, which end when this one ends, even if it is killed.
 
-    Each has its own pipe, and a thread in this process that waits at it. (The pool of Python's ``concurrent.futures``
-    has one pipe for all results, and hangs if a process is killed while it writes to it.)
+    Each has its own connection, and a thread in this process that waits at it. (The pool of Python's
+    ``concurrent.futures`` has one pipe for all results, and hangs if a process is killed while it writes to it.)
 
     Attributes:
         died: The error of a future of :meth:`submit` whose process has died.
@@ -62,7 +65,8 @@ class LocalWorkers:
         self.count = count
         self._numbers = itertools.count()
         self._of_thread = threading.local()
-        self._processes: dict[int, SpawnProcess] = {}  # by number
+        self._processes: dict[int, tuple[SpawnProcess, socket.socket]] = {}  # by number of the thread
+        self._parts: WeakKeyDictionary[Future, SimpleQueue[bytes]] = WeakKeyDictionary()  # that functions have sent
         self._is_closed = False
         self._threads = ThreadPoolExecutor(count, "worker", self._begin_thread)
 
@@ -73,55 +77,68 @@ class LocalWorkers:
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Future:
         """Returns a future of the function's result in one of the processes."""
-        return self._threads.submit(self._call, function, arguments)
+        parts: SimpleQueue[bytes] = SimpleQueue()
+        future = self._threads.submit(self._call, parts, function, arguments)
+        future.add_done_callback(lambda _: parts.put(b""))
+        self._parts[future] = parts
+        return future
 
     def result(self, future: Future) -> Any:
-        """Waits for a future of :meth:`submit` and returns its result, or raises the error of its function."""
-        return future.result()
+        """Waits for a future of :meth:`submit` and returns its result, or raises the error of its function.
+
+        If the function sends messages, an iterator of them is returned with the first. The process may die meanwhile.
+        """
+        parts = iter(self._parts.pop(future).get, b"")
+        first = next(parts, None)
+        return future.result() if first is None else itertools.chain([first], parts)
 
     def close(self) -> None:
         """Ends all processes at once."""
         self._is_closed = True
-        for process in list(self._processes.values()):
+        for process, _ in list(self._processes.values()):
             process.kill()
         self._threads.shutdown(cancel_futures=True)
+        for _, connection in self._processes.values():
+            connection.close()
 
     def _begin_thread(self) -> None:
-        self._of_thread.number, self._of_thread.connection = next(self._numbers), None
+        self._of_thread.number = next(self._numbers)
         if hasattr(signal, "pthread_sigmask"):
             resource_tracker.ensure_running()  # the first process would start it, which unblocks the signal
             signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # inherited by the processes that it starts
 
-    def _call(self, function: Callable[..., Any], arguments: tuple) -> Any:
-        """Returns the function's result in the process of this thread.
+    def _call(self, parts: SimpleQueue[bytes], function: Callable[..., Any], arguments: tuple) -> Any:
+        """Returns the function's result in the process of this thread; puts the messages that it sends into a queue.
 
         Raises:
             ChildProcessError: If the process dies. The next call starts another one.
         """
-        own = self._of_thread
-        own.connection = own.connection or self._start(own.number)
+        number = self._of_thread.number
+        _, connection = self._processes.get(number) or self._start(number)
         try:
-            own.connection.send((function, arguments))
-            result, error = own.connection.recv()
+            send(connection, pickle.dumps((function, arguments)))
+            while part := receive(connection):
+                parts.put(part)
+            result, error = pickle.loads(receive(connection))
         except (EOFError, OSError) as error:
-            own.connection.close()
-            own.connection = None
+            del self._processes[number]
+            connection.close()
             raise ChildProcessError("a worker died") from error
         if error:
             raise error
         return result
 
-    def _start(self, number: int) -> Connection:
-        """Starts a process and returns the connection to it."""
+    def _start(self, number: int) -> tuple[SpawnProcess, socket.socket]:
+        """Starts a process and returns it with the connection to it."""
         context = multiprocessing.get_context("spawn")  # Warp's threads do not survive a fork
-        connection, other = context.Pipe()
+        connection, other = socket.socketpair()
         process = context.Process(target=serve, args=(other, number, self.count), daemon=True)
         process.start()
         other.close()  # so that the connection ends when the process does
-        self._processes[number] = process
+        self._processes[number] = process, connection
         if self._is_closed:
             process.kill()
-        return connection
+        return self._processes[number]
 
 
 class Cluster:
@@ -193,7 +210,7 @@ def selection_without_initial_in_workers(scene: Scene, checks: Checks, workers: 
 
     Arguments and errors are those of :func:`check_in_workers`.
     """
-    call = WorkerCall("checked the first time", find_selection_without_initial, (pack(scene, checks),))
+    call = WorkerCall("checked the first time", selection_without_initial, (pack(scene, checks),))
     (selection,) = results_in_order(workers, deque([call]))
     return selection
 
