@@ -33,7 +33,7 @@ def print_replay(console: Console, summary: Summary) -> None:
     """Prints whether the scene is broken, by which pairs of meshes, the sums, and a table of the worst intervals."""
     scene, intervals = summary.scene, summary.intervals
     size = f"{count(len(scene.names), 'mesh', 'meshes')}, {scene.vertex_count:,} vertices, {scene.face_count:,} faces"
-    all_intervals = count(summary.interval_count, "interval")
+    all_intervals = count(len(summary.scene), "interval")
     say(console, f"{scene.path}: {size}, {all_intervals}; method {summary.method} on {summary.device}")
     for warning in scene.warnings:
         say(console, f"note: {with_option(warning)}")

@@ -187,7 +187,7 @@ class HitsCsv(RecordFile):
         lines += "".join(f"# inverted: {span.describe()}\n" for span in summary.inversion_spans)
         lines += f"# limit: {limited}\n" * bool(limited)
         if not summary.is_complete:
-            lines += f"# partial: {len(summary.intervals)} of {summary.interval_count} intervals; {summary.stopped}\n"
+            lines += f"# partial: {len(summary.intervals)} of {len(summary.scene)} intervals; {summary.stopped}\n"
         return lines
 
 

@@ -79,7 +79,7 @@ class Column(NamedTuple):
     Attributes:
         name: Name of the field.
         write: Returns the values of some rows, given pairs and the rows.
-        array: Name of the array; empty if :func:`_read_elements` makes it, or it is not stored.
+        array: Name of the array; empty if others make it, or it is not stored.
         read: Returns the array, given the values of all rows.
     """
 
@@ -169,12 +169,6 @@ def _write_pairs(
 
 def _read_pairs(interval: Interval, rows: list[dict], names: list[str], columns: Sequence[Column]) -> dict[str, Any]:
     """Returns the arrays of pairs of an interval, given the fields of each and the names of the meshes in the file."""
-    arrays = {column.array: column.read([row[column.name] for row in rows]) for column in columns if column.array}
-    return _read_elements(interval, rows, names) | arrays
-
-
-def _read_elements(interval: Interval, rows: list[dict], names: list[str]) -> dict[str, Any]:
-    """Returns the arrays that ``mesh`` and :data:`_ELEMENTS` describe, and the segment."""
     segment = interval.segment
     numbers = {mesh.name: number for number, mesh in enumerate(segment.meshes)}
     kinds = {word: kind for kind, word in enumerate(ELEMENT_WORDS)}
@@ -191,7 +185,8 @@ def _read_elements(interval: Interval, rows: list[dict], names: list[str]) -> di
         for end, members in ((0, ~of_face), (1, has_two)):
             vertices[members, side, end] = segment.find_vertices(meshes[members, side], indices[members, side, end])
         vertices[has_two, side] = np.sort(vertices[has_two, side], axis=1)
-    arrays = {"elements": elements, "meshes": meshes, "indices": indices, "vertices": vertices, "faces": faces}
+    arrays = {column.array: column.read([row[column.name] for row in rows]) for column in columns if column.array}
+    arrays |= {"elements": elements, "meshes": meshes, "indices": indices, "vertices": vertices, "faces": faces}
     return {"segment": segment} | arrays
 
 

@@ -9,22 +9,18 @@ from .results import IntervalResult, at_both
 from .scene_contacts import SceneContacts
 from .scene_intersections import SceneIntersections
 from .scene_proximities import SceneProximities
-from .summary import Summary
+from .summary import Summary, counted
 
 _Pairs = TypeVar("_Pairs", SceneContacts, SceneProximities)
 
 
 def limit_rows(result: IntervalResult, limit: int) -> IntervalResult:
-    """Returns the result of an interval with at most ``limit`` rows of each list, in their order.
+    """Returns the result of an interval with at most ``limit`` rows, at least 1, of each list, in their order.
 
     The lists are the collisions of the interval and, at its start and at its end, the edges that meet faces, the parts
     inside others and the proximities. The first row of each two meshes is kept, as far as there is room, then the first
     others. First are the earliest collisions and the nearest proximities; of edges those that belong to the first pairs
     of triangles, so that the curves along which these cut are whole. Rows are the same for any number of workers.
-
-    Args:
-        result: The result.
-        limit: The limit, at least 1.
     """
     return replace(
         result,
@@ -64,9 +60,8 @@ class NotListed:
         ]
         if not parts:
             return ""
-        rows = "row" if self.limit == 1 else "rows"
         return (
-            f"Listed are at most {self.limit:,} {rows} of a kind and interval, one of each two meshes first: "
+            f"Listed are at most {counted(self.limit, 'row')} of a kind and interval, one of each two meshes first: "
             f"{'; '.join(parts)}. Counts are those of all."
         )
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from ..usd.scene import Scene
 from .baseline import Baseline, NewFinding
-from .summary import CERTIFIED_FOR, CollisionSpan, IntersectionSpan, ProximitySpan, Summary
+from .summary import CERTIFIED_FOR, CollisionSpan, IntersectionSpan, ProximitySpan, Summary, counted
 
 MAX_PAIRS = 10_000
 """Largest number of pairs of meshes in the page."""
@@ -88,13 +88,13 @@ def verdict(summary: Summary) -> str:
     inverting = len({span.meshes for span in summary.inversion_spans})
     same = len({name for span in summary.duplicate_spans for name in span.meshes})
     verb = "collides or intersects" if len(pairs) == 1 else "collide or intersect"
-    parts = [f"{len(pairs):,} {_plural('pair', len(pairs))} of meshes {verb}"] * bool(pairs)
+    parts = [f"{counted(len(pairs), 'pair')} of meshes {verb}"] * bool(pairs)
     if later < len(pairs):
         parts[0] += f", {later:,} of them only after the first time" if later else ", at the first time already"
-    parts += [f"tetrahedra of {inverting:,} {_plural('mesh', inverting, 'es')} invert"] * bool(inverting)
+    parts += [f"tetrahedra of {counted(inverting, 'mesh', 'es')} invert"] * bool(inverting)
     parts += [f"{same:,} meshes are duplicates"] * bool(same)
     if near := len(summary.nearest):
-        parts.append(f"within {summary.clearance:g} of each other: {near:,} {_plural('pair', near)} of meshes")
+        parts.append(f"within {summary.clearance:g} of each other: {counted(near, 'pair')} of meshes")
     if not parts:
         return ""  # nothing was checked, or not all of it
     text = f"{'Broken' if pairs or inverting else 'Not broken, but'}: {'; '.join(parts)}."
@@ -102,7 +102,7 @@ def verdict(summary: Summary) -> str:
         (first, second), worst = pairs[0].meshes, pairs[0]
         depth, spans = worst.depth[0] if worst.depth else 0.0, [*worst.collisions, *worst.intersections]
         since, until = min(span.since for span in spans), max(span.until for span in spans)
-        deep = f"{length(summary.scene, depth)} deep" if depth else f"{worst.hits:,} {_plural('collision', worst.hits)}"
+        deep = f"{length(summary.scene, depth)} deep" if depth else counted(worst.hits, "collision")
         when = f"time {since:g}" + f" to {until:g}" * (until > since)
         of_these = " of these" * (0 < later < len(pairs))
         text += f" The worst{of_these}: {first} with {'itself' if first == second else second}, {deep}, {when}."
@@ -187,15 +187,14 @@ def report_data(summary: Summary, baseline: Baseline | None) -> dict:
         "validation": None,
     }
     if not summary.is_complete:
-        checked = f"{len(summary.intervals)} of {summary.interval_count} intervals were checked"
+        checked = f"{len(summary.intervals)} of {len(scene)} intervals were checked"
         data["partial"] = f"Partial: {checked}; {summary.stopped}."
     if not data["nothing"]:
         data["partial"] = " ".join(filter(None, (data["partial"], summary.not_checked)))
     if found := summary.validation:
-        wrong = len(found.disagreements)
         text = (
             f"The exact checker decided {found.hits:,} collisions and {found.others:,} other pairs again: "
-            f"{wrong:,} {'disagreement' if wrong == 1 else 'disagreements'}. Floating point had certified "
+            f"{counted(len(found.disagreements), 'disagreement')}. Floating point had certified "
             f"{found.certified:,} of all {found.decided:,} pairs."
         )
         data["validation"] = {"text": text, "disagreements": found.disagreements[:_MAX_DISAGREEMENTS]}
@@ -230,13 +229,10 @@ def _nothing_found(summary: Summary) -> str:
         what.append(f"nothing is within {summary.clearance:g} of another")
     times = f"time {scene.times[0]:g}" if scene.is_still else f"time {scene.times[0]:g} to {scene.times[-1]:g}"
     sentence = ", ".join(what)
-    checked = [f"{len(summary.intervals):,} {_plural('interval', len(summary.intervals))}"] * (not scene.is_still)
-    checked += [f"{at_rest:,} {_plural('time', at_rest)}"] * bool(at_rest)
-    text = (
-        f"{sentence[:1].upper()}{sentence[1:]}: {' and '.join(checked)} of {len(scene.names):,} "
-        f"{_plural('mesh', len(scene.names), 'es')} and {scene.face_count:,} "
-        f"{_plural('triangle', scene.face_count)} were checked, {times}"
-    )
+    checked = [counted(len(summary.intervals), "interval")] * (not scene.is_still)
+    checked += [counted(at_rest, "time")] * bool(at_rest)
+    of = f"{counted(len(scene.names), 'mesh', 'es')} and {counted(scene.face_count, 'triangle')}"
+    text = f"{sentence[:1].upper()}{sentence[1:]}: {' and '.join(checked)} of {of} were checked, {times}"
     text += f", certified for {CERTIFIED_FOR}." if summary.certified else ", not certified: collisions may be missing."
     if not at_rest:
         text += " Intersections at rest were not checked."
@@ -245,10 +241,6 @@ def _nothing_found(summary: Summary) -> str:
     if scene.selection.chooses_pairs:
         text += " Only some pairs of meshes were checked, as options say."
     return text
-
-
-def _plural(word: str, count: int, ending: str = "s") -> str:
-    return word if count == 1 else word + ending
 
 
 def _pairs_of_meshes(summary: Summary, new: Iterable[NewFinding]) -> list[dict]:

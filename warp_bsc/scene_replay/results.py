@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ..detection.inversions import Inversions
-from ..detection.results.collisions import DetectionStats, PhaseCounts
+from ..detection.results.collisions import DetectionStats
 from ..detection.run.settings import PairKind
 from ..usd.interval import Interval
 from ..usd.selection import Meant
@@ -191,16 +191,12 @@ class IntervalSummary:
     @property
     def pairs_tested(self) -> int:
         """Number of candidate pairs."""
-        return sum(phase.candidates for phase in self._phases)
+        return sum(getattr(self.stats, kind.label).candidates for kind in PairKind)
 
     @property
     def unsure(self) -> int:
         """Number of candidate pairs that floating point could not certify."""
-        return sum(phase.unsure for phase in self._phases)
-
-    @property
-    def _phases(self) -> list[PhaseCounts]:
-        return [getattr(self.stats, kind.label) for kind in PairKind]
+        return sum(getattr(self.stats, kind.label).unsure for kind in PairKind)
 
 
 @dataclass(frozen=True)

@@ -162,12 +162,7 @@ class Summary:
     @property
     def is_complete(self) -> bool:
         """Whether all intervals of the scene are finished."""
-        return len(self.intervals) == self.interval_count
-
-    @property
-    def interval_count(self) -> int:
-        """Number of intervals of the scene."""
-        return len(self.scene)
+        return len(self.intervals) == len(self.scene)
 
     @cached_property
     def colliding(self) -> list[IntervalSummary]:
@@ -329,15 +324,14 @@ class Summary:
             return ""
         meant, hits = sum(pair.meant is not None for pair in self.ignored), sum(pair.hits for pair in self.ignored)
         kinds = [(meant, "meant"), (len(self.ignored) - meant, "ignored")]
-        pairs = " and ".join(_count(number, f"{kind} pair") for number, kind in kinds if number)
-        return f"Not counted: {pairs} of meshes, {_count(hits, 'collision')}."
+        pairs = " and ".join(counted(number, f"{kind} pair") for number, kind in kinds if number)
+        return f"Not counted: {pairs} of meshes, {counted(hits, 'collision')}."
 
     @property
     def not_checked(self) -> str:
         """A sentence on the parts of the scene that are left out; empty if there are none."""
         parts = len(self.scene.left_out)
-        noun = "part" if parts == 1 else "parts"
-        return f"Not checked: {parts:,} {noun} that cannot be read, named as left out." if parts else ""
+        return f"Not checked: {counted(parts, 'part')} that cannot be read, named as left out." if parts else ""
 
     def first(self, count: int) -> "Summary":
         """Returns the summary of the first intervals alone."""
@@ -352,8 +346,9 @@ def _at_all_times(intervals: Iterable[tuple[_AtRest, _AtRest] | None]) -> list[_
     return [start for start, _ in found] + [end for _, end in found[-1:] if end.time != found[-1][0].time]
 
 
-def _count(number: int, one: str) -> str:
-    return f"{number:,} {one}{'s' * (number != 1)}"
+def counted(number: int, one: str, ending: str = "s") -> str:
+    """Returns a number of things, given the word for one and what more than one add to it."""
+    return f"{number:,} {one}{ending * (number != 1)}"
 
 
 def _joined(times: Iterable[list[_Span]], join: Callable[[_Span, _Span], _Span]) -> list[_Span]:

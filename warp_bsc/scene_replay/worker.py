@@ -67,12 +67,9 @@ _opened: _Opened | None = None
 
 
 def device_of_worker(name: str | None, number: int, gpu_count: int) -> str | None:
-    """Returns the name of the device that a worker on this machine uses: the named ones, or else the GPUs, in turns.
+    """Returns the name of the device that a worker on this machine uses, given its number, from 0.
 
-    Args:
-        name: Names of the requested devices, with commas between them, None for Warp's default.
-        number: Number of the worker, from 0.
-        gpu_count: Number of GPUs of the machine.
+    Workers use the devices whose names have commas between them, or, for None or ``"cuda"``, all GPUs, in turns.
     """
     if gpu_count and name in (None, "cuda"):
         return f"cuda:{number % gpu_count}"

@@ -57,11 +57,7 @@ class LocalWorkers:
     attempts = 3
 
     def __init__(self, count: int):
-        """Makes the pool; a process starts at its first call.
-
-        Args:
-            count: Number of processes, at least 1.
-        """
+        """Makes so many processes, at least 1, each of which starts at its first call."""
         self.count = count
         self._numbers = itertools.count()
         self._of_thread = threading.local()
@@ -110,8 +106,7 @@ class LocalWorkers:
     def _call(self, parts: SimpleQueue[bytes], function: Callable[..., Any], arguments: tuple) -> Any:
         """Returns the function's result in the process of this thread; puts the messages that it sends into a queue.
 
-        Raises:
-            ChildProcessError: If the process dies. The next call starts another one.
+        Raises a ChildProcessError if the process dies. The next call starts another one.
         """
         number = self._of_thread.number
         _, connection = self._processes.get(number) or self._start(number)
@@ -206,10 +201,7 @@ Workers = LocalWorkers | Cluster
 
 
 def selection_without_initial_in_workers(scene: Scene, checks: Checks, workers: Workers) -> Selection:
-    """Returns the result of ``IntervalChecker.selection_without_initial`` in a worker.
-
-    Arguments and errors are those of :func:`check_in_workers`.
-    """
+    """Returns :func:`.selection_without_initial` of a worker; arguments and errors are those of :func:`check_in_workers`."""
     call = WorkerCall("checked the first time", selection_without_initial, (pack(scene, checks),))
     (selection,) = results_in_order(workers, deque([call]))
     return selection
@@ -245,11 +237,7 @@ def check_in_workers(scene: Scene, checks: Checks, workers: Workers, first: int 
 
 
 def checked_address(address: str) -> str:
-    """Returns the address of a scheduler, the argument ``workers``.
-
-    Raises:
-        ValueError: If it is not an address such as ``"tcp://head:8786"``.
-    """
+    """Returns the argument ``workers``; raises a ValueError if it is no address such as ``"tcp://head:8786"``."""
     protocol, separator, host = address.partition("://")
     if not (protocol and separator and host):
         raise ValueError(f'workers must be an integer or an address such as "tcp://head:8786", not {given(address)}')
@@ -274,16 +262,9 @@ def checked_workers(workers: Any, devices: str | None) -> int | str | LocalWorke
 
 
 def device_of_cluster(address: str, name: str | None) -> str:
-    """Returns the name of the Warp device that a worker of a cluster uses.
+    """Returns the name of the Warp device that a worker of a cluster uses, given the requested one.
 
-    Args:
-        address: As of :class:`Cluster`.
-        name: Name of the requested device, None for Warp's default.
-
-    Raises:
-        ModuleNotFoundError: As of :class:`Cluster`.
-        OSError: As of :class:`Cluster`.
-        ValueError: If a worker has no such device.
+    Raises errors of :class:`Cluster`, and a ValueError if a worker has no such device.
     """
     with contextlib.closing(Cluster(str(checked_workers(address, name)))) as cluster:
         return cluster.result(cluster.submit(name_device, name))
@@ -317,13 +298,8 @@ class WorkerCall:
 def results_in_order(workers: Workers, calls: deque[WorkerCall]) -> Iterator[Any]:
     """Makes calls in workers and yields their results in order. A call whose worker dies is made again.
 
-    Args:
-        workers: The workers.
-        calls: The calls; each is removed when its result is there. Between two results, the caller may withdraw and
-            change the remaining ones, and add others before them.
-
-    Raises:
-        ChildProcessError: If worker after worker dies in the same call.
+    Each call is removed when its result is there. Between two results, the caller may withdraw and change the remaining
+    ones, and add others before them. Raises a ChildProcessError if worker after worker dies in the same call.
     """
     while calls:
         for call in islice(calls, 2 * workers.count):
