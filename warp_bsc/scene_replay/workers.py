@@ -201,7 +201,7 @@ Workers = LocalWorkers | Cluster
 
 
 def selection_without_initial_in_workers(scene: Scene, checks: Checks, workers: Workers) -> Selection:
-    """Returns :func:`.selection_without_initial` of a worker; arguments and errors are those of :func:`check_in_workers`."""
+    """Returns :func:`.selection_without_initial` of a worker, with arguments and errors of :func:`check_in_workers`."""
     call = WorkerCall("checked the first time", selection_without_initial, (pack(scene, checks),))
     (selection,) = results_in_order(workers, deque([call]))
     return selection
