@@ -8,6 +8,7 @@ import pickle
 import re
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -297,6 +298,26 @@ def test_what_a_worker_has_sent_is_there_before_it_ends_and_after(tmp_path):
         with pytest.raises(RuntimeError, match="ZeroDivisionError"):
             processes.result(processes.submit(*in_worker("1 / 0")))
         assert processes.result(processes.submit(abs, -1)) == 1
+
+
+def test_workers_of_both_kinds_hand_over_the_same(waves, monkeypatch):
+    """One on this machine while it checks a chunk, one of a cluster at the end."""
+    scene, checks = bsc.Scene(waves), checking.Checks(bsc.Selection(), "exact", "cpu", True, None, 0)
+    monkeypatch.setattr(worker, "_local", (0, 1))
+    job, found = worker.pack(scene, checks), []
+    here, there = socket.socketpair()
+    with here, there:
+        for starter in (None, there):
+            monkeypatch.setattr(worker, "_opened", None)
+            monkeypatch.setattr(worker, "_starter", starter)
+            parts = worker.check_chunk(job, 0, 4)
+            assert len(parts) == (0 if starter else 4)
+            parts = parts or [worker.receive(here) for _ in range(4)]
+            results = list(worker.unpack(scene, parts))
+            at_rest = [found for result in results for found in result.intersections]
+            assert [a is b for a, b in zip(at_rest[1::2], at_rest[2::2], strict=False)] == [True] * 3
+            found.append([(one.summary.mesh_pairs, one.contacts.interval.x1.tolist()) for one in results])
+    assert found[0] == found[1]
 
 
 def children_of(pid):

@@ -1,8 +1,9 @@
 """Checks the intervals of a scene in several processes, on this machine or on a Dask cluster.
 
-The intervals are divided into chunks. A worker opens the scene by its path, checks a chunk at a time, and returns the
-pickled results, with numbers for segments, which the receiving process has as well. Results are yielded in the order of
-the intervals. Chunks of a worker that dies are checked again by another one.
+The intervals are divided into chunks. A worker opens the scene by its path, checks a chunk at a time, and hands over
+the pickled results, with numbers for segments, which the receiving process has as well: on this machine each as soon as
+it is there, in a cluster a chunk at once. Results are yielded in the order of the intervals. What a worker that dies
+has not handed over is checked again by another one.
 
 A mesh found to be broken is left out from then on. Results of later intervals that workers have computed with it are
 dropped, and their chunks are checked again.
