@@ -116,7 +116,7 @@ class LocalWorkers:
             while part := receive(connection):
                 parts.put(part)
             result, error = pickle.loads(receive(connection))
-        except (EOFError, OSError) as error:
+        except (EOFError, OSError, MemoryError) as error:  # its rest would be taken for the next message
             del self._processes[number]
             connection.close()
             raise ChildProcessError("a worker died") from error
