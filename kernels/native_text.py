@@ -8,9 +8,9 @@ from collections.abc import Mapping
 from pathlib import Path
 
 
-def header(module: str, name: str) -> str:
-    """Returns the text of a header, by the file of a module beside it and its name."""
-    return (Path(module).parent / "native" / name).read_text(encoding="utf-8")
+def header(module: str, *names: str) -> str:
+    """Returns the text of headers, one after the other, by the file of a module beside them and their names."""
+    return "".join((Path(module).parent / "native" / name).read_text(encoding="utf-8") for name in names)
 
 
 def definitions(types: Mapping[str, str], **constants: bool | int | float) -> str:

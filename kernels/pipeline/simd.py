@@ -39,5 +39,5 @@ def native_for_pairs(dtype: type, vertex_face: bool, *headers: str, **constants:
         constants: Numbers that they use, by name; ``roundoff`` too, if it is no argument.
     """
     scalar = {"Scalar": "float" if dtype is wp.vec3 else "double"}
-    texts = [header(__file__, name) for name in ("positions.h", "simd.h", "simd_query.h", *headers)]
-    return definitions(scalar, vertex_face=vertex_face, **_CONSTANTS, **constants) + "".join(texts)
+    text = header(__file__, "lanes.h", "positions.h", "simd.h", "simd_query.h", *headers)
+    return definitions(scalar, vertex_face=vertex_face, **_CONSTANTS, **constants) + text

@@ -34,55 +34,50 @@ class WideBvh:
     level_starts: wp.array[int]
 
 
-@wp.func_native(snippet=header(__file__, "append.h") + header(__file__, "pair_packet.h"))
-def pair_packet(
-    packet: int,
-    tree: WideBvh,
-    traversed: WideBvh,
-    pair_filter: PairFilter,
-    # options
-    symmetric: int,
-    ordered: int,
-    keep_separated: int,
-    at_end: int,
-    # in and out
-    counts: wp.array[wp.int64],
-    filtered_of_worlds: wp.array[wp.int64],
-    # indices of counts
-    queued_count: int,
-    filtered_count: int,
-    # out
-    pairs: wp.array[wp.vec2i],
-):
-    """Enqueues the pairs of a packet's elements with those of a tree that share no corner, and whose boxes overlap.
+@functools.cache
+def pair_packet_of(**constants: bool | int) -> wp.Function:
+    """Returns the function that enqueues the pairs of a packet's elements with those of a tree, on a CPU.
 
-    Those are the swept boxes, unless an axis separates the two at the start and at the end, on the same side; with
-    ``keep_separated`` such pairs are enqueued as well. With ``at_end`` they are the boxes at the end. Pairs without a
-    changed element are excluded, and those within a rigid body, by marks. With ``symmetric`` both are of one tree, and
-    each pair is found once. With ``ordered`` the smaller number comes first, else that of the packet. With groups, the
-    pairs that a :class:`.pairs.PairFilter` leaves out are counted, by world as well if there is an array for that, and
-    are not enqueued.
+    They share no corner, and their swept boxes overlap, unless an axis separates the two at the start and at the end,
+    on the same side; with ``keep_separated`` such pairs are enqueued as well. Pairs without a changed element are
+    excluded, and those within a rigid body, by marks. With groups, the pairs that a :class:`.pairs.PairFilter` leaves
+    out are counted, by world as well if there is an array for that, and are not enqueued.
+
+    Args:
+        constants: What is known when it is compiled: ``corners`` and ``other_corners`` of an element; ``symmetric``,
+            for pairs of one tree, each found once; ``ordered``, for the smaller number first, else that of the packet;
+            ``at_end``, for boxes at the end; ``queued`` and ``filtered``, the indices of these counts.
     """
-    ...
+
+    @wp.func_native(definitions({}, **constants) + header(__file__, "lanes.h", "append.h", "pair_packet.h"))
+    def pair_packet(
+        packet: int,
+        tree: WideBvh,
+        traversed: WideBvh,
+        pair_filter: PairFilter,
+        keep_separated: int,
+        # out
+        counts: wp.array[wp.int64],
+        filtered_of_worlds: wp.array[wp.int64],
+        pairs: wp.array[wp.vec2i],
+    ): ...
+
+    return pair_packet
 
 
 @functools.cache
 def fit_packet_of(dtype: type) -> wp.Function:
-    """Returns the function that fits the boxes of a packet to a motion, for one type of position.
+    """Returns the function that fits the boxes of a packet to a motion, for one type of position, vec3 or vec3d.
 
-    Args:
-        dtype: Type of a position, vec3 or vec3d.
-
-    Returns:
-        Device function for the CPU. Its arguments are the packet, the number of its elements, the positions at both
-        ends, the mark of each vertex or None for 1, how far boxes reach beyond each vertex or None, and the tree. It
-        writes the boxes, the packet's entry in its node, and the marks of the elements. Boxes are rounded as by
-        :func:`~warp_bsc.kernels.boxes.rounded`. That of an element with a position that is not finite is empty.
-        Indices are not checked.
+    It is a device function for the CPU. Its arguments are the packet, the number of its elements, the positions at both
+    ends, the mark of each vertex or None for 1, how far boxes reach beyond each vertex or None, and the tree. It writes
+    the boxes, the packet's entry in its node, and the marks of the elements. Boxes are rounded as by
+    :func:`~warp_bsc.kernels.boxes.rounded`. That of an element with a position that is not finite is empty. Indices are
+    not checked.
     """
     scalar = definitions({"Scalar": "float" if dtype is wp.vec3 else "double"})
 
-    @wp.func_native(scalar + header(__file__, "positions.h") + header(__file__, "fit_packet.h"))
+    @wp.func_native(scalar + header(__file__, "lanes.h", "positions.h", "fit_packet.h"))
     def fit_packet(
         packet: int,
         count: int,

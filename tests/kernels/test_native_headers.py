@@ -15,7 +15,7 @@ from warp_bsc.kernels.pipeline.batch_arc_culling import cull_arc_batch_of
 from warp_bsc.kernels.pipeline.batch_classification import classify_batch_of
 from warp_bsc.kernels.pipeline.batch_culling import cull_batch_of
 from warp_bsc.kernels.pipeline.batch_impacts import impact_batch_of
-from warp_bsc.kernels.pipeline.wide_bvh import fit_packet_of, pair_packet
+from warp_bsc.kernels.pipeline.wide_bvh import fit_packet_of, pair_packet_of
 
 ROOT = Path(__file__).parents[2]
 HEADERS = {path.relative_to(ROOT).as_posix(): path.read_text() for path in sorted((ROOT / "kernels").rglob("*.h"))}
@@ -32,7 +32,10 @@ def native_functions():
     """All native functions that headers make, with every type and number of limbs."""
     types = (wp.vec3, wp.vec3d)
     functions = [make(dtype, is_face) for make in OF_PAIRS for dtype in types for is_face in (False, True)]
-    functions += [*map(fit_packet_of, types), pair_packet, make_narrow_polygon, near_signs_at_roots, minor, scaled_like]
+    options = [{"symmetric": flag, "ordered": flag, "at_end": not flag} for flag in (False, True)]
+    corners = {"corners": 2, "other_corners": 3, "queued": 0, "filtered": 1}
+    functions += [pair_packet_of(**corners, **flags) for flags in options]
+    functions += [*map(fit_packet_of, types), make_narrow_polygon, near_signs_at_roots, minor, scaled_like]
     return [overload for function in functions for overload in function.user_overloads.values()]
 
 

@@ -1,6 +1,5 @@
 // The body of cull_arc_batch; after simd_query.h.
 
-auto larger_of = [](double a, double b) { return a > b ? a : b; };
 auto norm_bound = [=](Vectors a) { return __builtin_elementwise_sqrt(dot(a, a)) * inflated; };
 auto to_multiple = [](Doubles time) { return (time + 0x1p12) - 0x1p12; };  // of 2^-40
 constexpr int corner_count = vertex_face ? 3 : 4;
@@ -26,8 +25,8 @@ auto read_packet = [&](auto which, int filled) -> Packet {
     for (int lane = 0; lane < 8; ++lane) {
         const Four corner = corners_of(slot(lane));
         const double* of = (const double*)deviation.data;
-        const double a = of[corner[0]], b = of[corner[1]], other = larger_of(of[corner[2]], of[corner[3]]);
-        distance[lane] = vertex_face ? a + larger_of(b, other) : larger_of(a, b) + other;
+        const double a = of[corner[0]], b = of[corner[1]], other = most(of[corner[2]], of[corner[3]]);
+        distance[lane] = vertex_face ? a + most(b, other) : most(a, b) + other;
     }
     const int all = (1 << filled) - 1;
     int usable = all;
@@ -40,11 +39,10 @@ for (int begin = 0; begin < count; begin += 8) {
     const int filled = count - begin < 8 ? count - begin : 8;
     const Packet packet = read_packet([&](int lane) { return begin + lane; }, filled);
     const Motion& motion = packet.motion;
-    const Doubles kept = packet.kept;
     const Coplanarity y = coplanarity(motion);
     const Doubles error = normal_error * roundoff * (y.uv.x + y.uv.y + y.uv.z) + roundoff * underflow;
     const Doubles norm_0 = norm_bound(y.n0) + error, norm_h = norm_bound(y.nh) + error;
-    const Doubles norm_1 = norm_bound(y.n1) + error, far = kept * inflated, y_bound = plane_error * y.bound;
+    const Doubles norm_1 = norm_bound(y.n1) + error, far = packet.kept * inflated, y_bound = plane_error * y.bound;
     const Doubles far_1 = far * ((norm_0 + 2.0 * norm_h) * (1.0 / 3.0));
     const Doubles far_2 = far * ((2.0 * norm_h + norm_1) * (1.0 / 3.0));
     auto above = [&](Cubic k) {
@@ -55,9 +53,9 @@ for (int begin = 0; begin < count; begin += 8) {
     const Vectors size = plus(plus(motion.u_size, motion.v_size), motion.w_size);
     if (unsure) {
         const Vectors direction = centroid_direction(motion);
-        const Gaps gaps = gaps_along(motion, direction);
-        const Doubles bound = gap_bound(size, direction), needed = kept * norm_bound(direction);
-        unsure &= ~(bits((gaps.low - bound > needed) | (-gaps.high - bound > needed)) & packet.usable);
+        const auto gaps = gaps_along(motion, direction);
+        const Doubles bound = gap_bound(size, direction), needed = packet.kept * norm_bound(direction);
+        unsure &= ~(bits((gaps.lowest - bound > needed) | (-gaps.highest - bound > needed)) & packet.usable);
     }
     for (; unsure; unsure &= unsure - 1)
         open[open_count++] = begin + __builtin_ctz(unsure);

@@ -193,7 +193,7 @@ auto insert = [](Doubles into, const double* list, unsigned lanes) {
 // the search of each lane for its first contact, see first_contact
 const double shortest = finest * length;
 Query query = {};
-double time_found[batch], time_of_contact[batch];
+double time_found[batch], time_of_contact[batch + 8];
 signed char outcome[batch];
 Doubles start = 0.0, end = 1.0, root = 0.0;
 int ahead = 0, passing = 0, halved = 0, probing = 0, probed = 0, begun = 0, certain = 0, running = 0;
@@ -330,9 +330,8 @@ for (int begin = 0; begin < query_count; begin += 8) {
         Motion motion;
         for (int i = 0; i < rows_of_motion; ++i)
             __builtin_memcpy((Doubles*)&motion + i, queries[i] + begin, sizeof(Doubles));
-        Doubles t = 0.0;
-        for (int lane = 0; lane < filled; ++lane)
-            t[lane] = time_of_contact[begin + lane];
+        Doubles t;
+        __builtin_memcpy(&t, time_of_contact + begin, sizeof(t));
         normals = contact_at(motion, t, at);
     }
     for (int lane = 0; lane < filled; ++lane) {

@@ -1,26 +1,24 @@
-// Vectors of eight numbers, and the points of eight pairs. Of elements, pairs; vertex_face; after positions.h.
+// Vectors of eight numbers, and the points of eight pairs. Of elements, pairs; vertex_face; after lanes.h, positions.h.
 
-typedef double Doubles __attribute__((ext_vector_type(8)));
-typedef decltype(Doubles() < Doubles()) Longs;
-typedef int Ints __attribute__((ext_vector_type(8), aligned(4)));
-typedef bool Bools __attribute__((ext_vector_type(8)));
 struct Vectors {
     Doubles x, y, z;
 };
+struct FloatVectors {
+    Floats x, y, z;
+};
 
-auto bits = [](auto mask) -> int { return __builtin_bit_cast(unsigned char, __builtin_convertvector(mask, Bools)); };
-// one instruction each, unlike __builtin_elementwise_min, which prefers numbers to NaN in either argument
-auto least = [](Doubles a, Doubles b) { return b < a ? b : a; };
-auto most = [](Doubles a, Doubles b) { return b > a ? b : a; };
-auto absolute = [](Doubles a) { return __builtin_elementwise_abs(a); };
-auto larger = [=](Doubles a, Doubles b) { return most(absolute(a), absolute(b)); };
-auto sizes = [=](Vectors a, Vectors b) { return Vectors{larger(a.x, b.x), larger(a.y, b.y), larger(a.z, b.z)}; };
-auto plus = [](Vectors a, Vectors b) { return Vectors{a.x + b.x, a.y + b.y, a.z + b.z}; };
-auto minus = [](Vectors a, Vectors b) { return Vectors{a.x - b.x, a.y - b.y, a.z - b.z}; };
-auto times = [](Doubles a, Vectors b) { return Vectors{a * b.x, a * b.y, a * b.z}; };
-auto dot = [](Vectors a, Vectors b) { return a.x * b.x + a.y * b.y + a.z * b.z; };
-auto cross = [](Vectors a, Vectors b) {
-    return Vectors{a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
+auto absolute = [](auto a) { return __builtin_elementwise_abs(a); };
+auto larger = [=](auto a, auto b) { return most(absolute(a), absolute(b)); };
+auto sizes = [=](auto a, auto b) { return decltype(a){larger(a.x, b.x), larger(a.y, b.y), larger(a.z, b.z)}; };
+auto plus = [](auto a, auto b) { return decltype(a){a.x + b.x, a.y + b.y, a.z + b.z}; };
+auto minus = [](auto a, auto b) { return decltype(a){a.x - b.x, a.y - b.y, a.z - b.z}; };
+auto times = [](auto a, auto b) {
+    const decltype(b.x) factor = a;
+    return decltype(b){factor * b.x, factor * b.y, factor * b.z};
+};
+auto dot = [](auto a, auto b) { return a.x * b.x + a.y * b.y + a.z * b.z; };
+auto cross = [](auto a, auto b) {
+    return decltype(a){a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
 };
 
 // loaded as vectors: of single numbers, the compiler would make gathers, which take longer
@@ -58,17 +56,18 @@ auto read_points = [&](auto slot, int filled) -> Points {
 };
 
 // the differences u, v, w of eight pairs at both ends
-struct Relative {
-    Vectors u0, v0, w0, u1, v1, w1;
-};
-auto relative = [&](const Points& points) -> Relative {
+auto relative = [&](const Points& points, auto example) {
+    typedef decltype(example) Of;
+    struct Relative {
+        Of u0, v0, w0, u1, v1, w1;
+    };
     auto point = [&](int i) {
-        auto coordinate = [&](int axis) { return __builtin_convertvector(points.x[3 * i + axis], Doubles); };
-        return Vectors{coordinate(0), coordinate(1), coordinate(2)};
+        auto coordinate = [&](int axis) { return __builtin_convertvector(points.x[3 * i + axis], decltype(Of::x)); };
+        return Of{coordinate(0), coordinate(1), coordinate(2)};
     };
     if (vertex_face)
-        return {minus(point(2), point(1)), minus(point(3), point(1)), minus(point(0), point(1)),
-                minus(point(6), point(5)), minus(point(7), point(5)), minus(point(4), point(5))};
-    return {minus(point(1), point(0)), minus(point(3), point(2)), minus(point(2), point(0)),
-            minus(point(5), point(4)), minus(point(7), point(6)), minus(point(6), point(4))};
+        return Relative{minus(point(2), point(1)), minus(point(3), point(1)), minus(point(0), point(1)),
+                        minus(point(6), point(5)), minus(point(7), point(5)), minus(point(4), point(5))};
+    return Relative{minus(point(1), point(0)), minus(point(3), point(2)), minus(point(2), point(0)),
+                    minus(point(5), point(4)), minus(point(7), point(6)), minus(point(6), point(4))};
 };

@@ -19,20 +19,25 @@ auto lanes_of = [](int lanes) -> Longs {
     return -__builtin_convertvector(__builtin_bit_cast(Bools, (unsigned char)lanes), Longs);
 };
 
-struct Cubic {
-    Doubles k0, k1, k2, k3;
+// the lowest and the highest of some numbers
+auto range = [](auto low, auto high) {
+    struct Range {
+        decltype(low) lowest, highest;
+    };
+    return Range{low, high};
+};
+auto outside = [](auto range, auto bound) { return (range.lowest > bound) | (range.highest < -bound); };
+auto across = [](auto range, auto bound) { return (range.lowest < -bound) & (range.highest > bound); };
+auto range_of = [=](auto k) {
+    return range(least(least(k.k0, k.k1), least(k.k2, k.k3)), most(most(k.k0, k.k1), most(k.k2, k.k3)));
 };
 // the lanes in which all coefficients certainly have one sign
-auto one_sign = [=](Cubic k, Doubles bound) -> int {
-    const Doubles low = least(least(k.k0, k.k1), least(k.k2, k.k3));
-    const Doubles high = most(most(k.k0, k.k1), most(k.k2, k.k3));
-    return bits((low > bound) | (high < -bound));
-};
+auto one_sign = [=](auto k, Doubles bound) { return bits(outside(range_of(k), bound)); };
 // a quadratic has its Bernstein coefficients in x, y and z
 auto quadratic_sign = [=](Vectors q, Doubles bound) {
     return Signs{bits(least(q.x, least(q.y, q.z)) > bound), bits(most(q.x, most(q.y, q.z)) < -bound)};
 };
-auto largest_of = [=](Vectors a) { return most(absolute(a.x), most(absolute(a.y), absolute(a.z))); };
+auto largest_of = [=](auto a) { return most(absolute(a.x), most(absolute(a.y), absolute(a.z))); };
 
 auto inverse_power_of_two = [](Doubles a) {
     const Longs exponent = (__builtin_bit_cast(Longs, a) >> 52) & 2047;
@@ -44,12 +49,11 @@ struct Motion {
     Doubles scale;
 };
 auto scaled_motion = [&](const Points& points, int& usable) -> Motion {
-    Relative r = relative(points);
+    const auto r = relative(points, Vectors());
     Vectors u = sizes(r.u0, r.u1), v = sizes(r.v0, r.v1), w = sizes(r.w0, r.w1);
     const Doubles size = most(largest_of(u), most(largest_of(v), largest_of(w)));
     usable &= bits((size >= 0x1p-480) & (size < 0x1p1023));
     if constexpr (sizeof(Scalar) == 4) {
-        typedef float Floats __attribute__((ext_vector_type(8)));
         typedef unsigned Words __attribute__((ext_vector_type(8)));
         Words smallest = 0xffffffffu;
         for (int i = 0; i < 24; ++i) {  // zero becomes the largest number
@@ -66,17 +70,24 @@ auto cross_size = [](Vectors a, Vectors b) {
     return Vectors{a.y * b.z + a.z * b.y, a.z * b.x + a.x * b.z, a.x * b.y + a.y * b.x};
 };
 // the cubic of a motion, or of one that is not scaled, and the coefficients of the normal
-struct Coefficients {
-    Cubic k;
-    Vectors n0, nh, n1;
+auto coefficients = [=](const auto& m) {
+    struct Coefficients {
+        struct {
+            decltype(m.u0.x) k0, k1, k2, k3;
+        } k;
+        decltype(m.u0) n0, nh, n1;
+    };
+    const auto n0 = cross(m.u0, m.v0), n1 = cross(m.u1, m.v1);
+    const auto nh = times(0.5, plus(cross(m.u0, m.v1), cross(m.u1, m.v0)));
+    const decltype(m.u0.x) third = 1.0 / 3.0, twice = 2.0;
+    return Coefficients{{dot(m.w0, n0), (twice * dot(m.w0, nh) + dot(m.w1, n0)) * third,
+                         (twice * dot(m.w1, nh) + dot(m.w0, n1)) * third, dot(m.w1, n1)},
+                        n0,
+                        nh,
+                        n1};
 };
-auto coefficients = [=](const auto& m) -> Coefficients {
-    const Vectors n0 = cross(m.u0, m.v0), n1 = cross(m.u1, m.v1);
-    const Vectors nh = times(0.5, plus(cross(m.u0, m.v1), cross(m.u1, m.v0)));
-    const Cubic k = {dot(m.w0, n0), (2.0 * dot(m.w0, nh) + dot(m.w1, n0)) * (1.0 / 3.0),
-                     (2.0 * dot(m.w1, nh) + dot(m.w0, n1)) * (1.0 / 3.0), dot(m.w1, n1)};
-    return {k, n0, nh, n1};
-};
+typedef decltype(coefficients(Motion())) Coefficients;
+typedef decltype(Coefficients::k) Cubic;
 struct Coplanarity : Coefficients {
     Doubles bound;
     Vectors uv;
@@ -202,33 +213,26 @@ auto between = [=](Coordinates c, Vectors u, Vectors v, Vectors w) {
 };
 
 // by how much a direction separates the features at both ends, on either side
-struct Gaps {
-    Doubles low, high;
-};
-auto gaps_along = [=](const auto& m, Vectors direction) -> Gaps {
-    const Doubles u0 = dot(direction, m.u0), v0 = dot(direction, m.v0), w0 = dot(direction, m.w0);
-    const Doubles u1 = dot(direction, m.u1), v1 = dot(direction, m.v1), w1 = dot(direction, m.w1), zero = 0.0;
-    Doubles low, high;
-    if (vertex_face) {
-        low = least(w0 - most(most(u0, v0), zero), w1 - most(most(u1, v1), zero));
-        high = most(w0 - least(least(u0, v0), zero), w1 - least(least(u1, v1), zero));
-    } else {
-        low = least(w0 - most(u0, zero) + least(v0, zero), w1 - most(u1, zero) + least(v1, zero));
-        high = most(w0 - least(u0, zero) + most(v0, zero), w1 - least(u1, zero) + most(v1, zero));
-    }
-    return {low, high};
+auto gaps_along = [=](const auto& m, auto direction) {
+    const auto u0 = dot(direction, m.u0), v0 = dot(direction, m.v0), w0 = dot(direction, m.w0);
+    const auto u1 = dot(direction, m.u1), v1 = dot(direction, m.v1), w1 = dot(direction, m.w1);
+    const decltype(direction.x) zero = 0.0;
+    if (vertex_face)
+        return range(least(w0 - most(most(u0, v0), zero), w1 - most(most(u1, v1), zero)),
+                     most(w0 - least(least(u0, v0), zero), w1 - least(least(u1, v1), zero)));
+    return range(least(w0 - most(u0, zero) + least(v0, zero), w1 - most(u1, zero) + least(v1, zero)),
+                 most(w0 - least(u0, zero) + most(v0, zero), w1 - least(u1, zero) + most(v1, zero)));
 };
 auto gap_bound = [=](Vectors size, Vectors direction) {
     return roundoff * (direction_error * dot(sizes(direction, direction), size) + underflow);
 };
 // the direction through the centroids at half time
 auto centroid_direction = [=](const auto& m) {
-    const Vectors u = plus(m.u0, m.u1), v = plus(m.v0, m.v1), w = plus(m.w0, m.w1);
+    const auto u = plus(m.u0, m.u1), v = plus(m.v0, m.v1), w = plus(m.w0, m.w1);
     return vertex_face ? minus(w, times(1.0 / 3.0, plus(u, v))) : plus(w, times(0.5, minus(v, u)));
 };
 // the lanes in which a direction certainly separates the features at both ends, on the same side
 auto direction_separates = [=](const Motion& m, Vectors direction) -> int {
-    const Gaps gaps = gaps_along(m, direction);
     const Doubles bound = gap_bound(plus(plus(m.u_size, m.v_size), m.w_size), direction);
-    return bits((gaps.low > bound) | (gaps.high < -bound));
+    return bits(outside(gaps_along(m, direction), bound));
 };

@@ -85,6 +85,21 @@ def test_culls_are_those_of_one_query(kind, dtype):
         assert not getattr(checker, kind)(points[culled]).any()
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_single_precision_decides_as_double_precision(kind):
+    """What boxes leave is decided in single precision first where they are known to meet, else in double precision."""
+    rng = np.random.default_rng(8)
+    names = ("uniform", "mostly_hits", "integer_lattice", "one_ulp_apart", "resting_contact", "grazing", "touching")
+    points = np.concatenate([GENERATORS[name](rng, 500, kind, np.float32) for name in names])
+    for exponent in (-145, -60, -48, -45, -42, -36, -32, 0, 36, 40, 44, 100):
+        scaled = np.ldexp(points, exponent + rng.integers(-2, 3, (len(points), 1, 1))).astype(np.float32)
+        meet = boxes_meet(kind, scaled)
+        for roundoff in (0.0, float(ROUNDOFF)):
+            _, in_double = cull(kind, scaled, roundoff)
+            _, in_single = cull(kind, scaled, roundoff, boxes_meet=True)
+            assert np.array_equal(in_single & meet, in_double)
+
+
 def boxes_meet(kind, points):
     """Whether no axis separates the boxes of the two elements at both ends."""
     ends = points.reshape(-1, 2, 4, 3)

@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from ...kernels.pairs import PairFilter
-from ...kernels.pipeline.wide_bvh import WideBvh, fit_packet_of, pair_packet
+from ...kernels.pipeline.wide_bvh import WideBvh, fit_packet_of, pair_packet_of
 from ..run.launch import Launch, launch_over, launch_together, made_once
 from ..run.settings import NO_GRADIENTS, Count
 
@@ -128,38 +128,28 @@ def _fill_packets(
     node_marks[packet / 8, 1, packet % 8] = elements[packet, 32 + count - 1]
 
 
-@wp.kernel(**NO_GRADIENTS)
-def _pair_packets(
-    first: int,
-    tree: WideBvh,
-    traversed: WideBvh,
-    # options
-    pair_filter: PairFilter,
-    symmetric: int,
-    ordered: int,
-    keep_separated: int,
-    at_end: int,
-    # out
-    counts: wp.array[wp.int64],
-    filtered_of_worlds: wp.array[wp.int64],
-    pairs: wp.array[wp.vec2i],
-):
-    """Enqueues the pairs of a packet's elements with those of a tree, a packet a thread."""
-    pair_packet(
-        first + wp.tid(),
-        tree,
-        traversed,
-        pair_filter,
-        symmetric,
-        ordered,
-        keep_separated,
-        at_end,
-        counts,
-        filtered_of_worlds,
-        Count.QUEUED,
-        Count.FILTERED,
-        pairs,
-    )
+@made_once
+def _pairing_kernel(**constants: bool | int) -> wp.Kernel:
+    """Returns the kernel that enqueues the pairs of two trees, see :func:`.wide_bvh.pair_packet_of`."""
+    pair_packet = pair_packet_of(**constants, queued=int(Count.QUEUED), filtered=int(Count.FILTERED))
+
+    @wp.kernel(**NO_GRADIENTS)
+    def pair_packets(
+        first: int,
+        tree: WideBvh,
+        traversed: WideBvh,
+        pair_filter: PairFilter,
+        keep_separated: int,
+        # out
+        counts: wp.array[wp.int64],
+        filtered_of_worlds: wp.array[wp.int64],
+        pairs: wp.array[wp.vec2i],
+    ):
+        """Enqueues the pairs of a packet's elements with those of a tree, a packet a thread."""
+        packet = first + wp.tid()
+        pair_packet(packet, tree, traversed, pair_filter, keep_separated, counts, filtered_of_worlds, pairs)
+
+    return pair_packets
 
 
 @wp.kernel(**NO_GRADIENTS)
@@ -295,9 +285,10 @@ class WideTree:
             at_end: Whether to enqueue the pairs that overlap at the end of the motion.
             filtered_of_worlds: Counts of the pairs that are left out, by world, array of int64; None for none.
         """
-        options = [self._filter, other is self, ordered, keep_separated, at_end]
-        inputs = [self._tree, other._tree, *options, counts, filtered_of_worlds]
-        return _pair_packets, len(self._boxes) if len(other._boxes) else 0, inputs, [pairs]
+        corners = {"corners": self._tree.corners, "other_corners": other._tree.corners}
+        kernel = _pairing_kernel(**corners, symmetric=other is self, ordered=ordered, at_end=at_end)
+        inputs = [self._tree, other._tree, self._filter, keep_separated, counts, filtered_of_worlds]
+        return kernel, len(self._boxes) if len(other._boxes) else 0, inputs, [pairs]
 
 
 def fit_trees(trees: Sequence[WideTree], x0: wp.array, x1: wp.array, changed: wp.array | None) -> None:
