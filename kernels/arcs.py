@@ -107,25 +107,17 @@ def on_arc(x0: Any, x1: Any, centre: wp.vec3d, turn: wp.vec3d, time: wp.float64)
 class Arcs:
     """The arcs of a mesh's vertices in a step; without arrays all vertices move straight.
 
-    Attributes:
-        turning: 1 if a vertex turns, one number; where it is 0, nothing else is read.
-        body: Body of each vertex, -1 for those that move straight.
-        rigid_id: Vertices of one, 0 or more, keep their distances: pairs of them with a turning vertex are excluded.
-        centre: A point of each body's axis at the start.
-        turn: Axis of each body times the angle of its turn [rad].
-        bounds: Bounds of how far each vertex is from its chord, see :func:`arc_bounds`.
-        deviation: The same over the whole step, one number, 0 for vertices that move straight.
-        tolerance: Distance within which pairs may be reported that do not collide; 0 for :data:`DEFAULT_TOLERANCE`.
+    Vertices of one ``rigid_id``, 0 or more, keep their distances: pairs of them with a turning vertex are excluded.
     """
 
-    turning: wp.array[int]
-    body: wp.array[int]
+    turning: wp.array[int]  # 1 if a vertex turns, one number; where it is 0, nothing else is read
+    body: wp.array[int]  # of each vertex, -1 for those that move straight
     rigid_id: wp.array[int]
-    centre: wp.array[wp.vec3d]
-    turn: wp.array[wp.vec3d]
-    bounds: wp.array[wp.vec3d]
-    deviation: wp.array[wp.float64]
-    tolerance: wp.float64
+    centre: wp.array[wp.vec3d]  # a point of each body's axis at the start
+    turn: wp.array[wp.vec3d]  # axis of each body times the angle of its turn [rad]
+    bounds: wp.array[wp.vec3d]  # of how far each vertex is from its chord, see arc_bounds
+    deviation: wp.array[wp.float64]  # the same over the whole step, one number, 0 for vertices that move straight
+    tolerance: wp.float64  # within which pairs may be reported that do not collide; 0 for DEFAULT_TOLERANCE
 
 
 @wp.func
@@ -256,8 +248,7 @@ def _closing_way(kind: int, part: Impact, chords: Query) -> wp.float64:
 def _first_contact(kind: int, part: Impact, chords: Query, rounding: wp.float64) -> Impact:
     """Returns the contact of a part with coordinates and normal as of contacts on straight paths."""
     result = part
-    motion = query_motion(kind, chords, ZERO)
-    coordinates, normal = contact_at(motion, part.toi)
+    coordinates, normal = contact_at(query_motion(kind, chords, ZERO), part.toi)
     result.coordinates = coordinates
     # where paths graze, velocities do not tell the side, but all until the part began is free
     weights = contact_weights(kind, coordinates)

@@ -30,15 +30,13 @@ def lowered(x: Any, padding: wp.float64) -> wp.vec3:
 
     Both roundings keep order: boxes of elements overlap that are at most the sum of their paddings apart.
     """
-    pad = wp.vec3d(padding, padding, padding)
-    return rounded(wp.vec3d(wp.float64(x[0]), wp.float64(x[1]), wp.float64(x[2])) - pad)
+    return rounded(wp.vec3d(wp.float64(x[0]), wp.float64(x[1]), wp.float64(x[2])) - wp.vec3d(padding))
 
 
 @wp.func
 def raised(x: Any, padding: wp.float64) -> wp.vec3:
     """Returns a corner moved up by a padding, see :func:`lowered`."""
-    pad = wp.vec3d(padding, padding, padding)
-    return rounded(wp.vec3d(wp.float64(x[0]), wp.float64(x[1]), wp.float64(x[2])) + pad)
+    return rounded(wp.vec3d(wp.float64(x[0]), wp.float64(x[1]), wp.float64(x[2])) + wp.vec3d(padding))
 
 
 @wp.func

@@ -77,8 +77,7 @@ def _reach(motion: Motion, distance: wp.float64, found: Impact, tolerance: wp.fl
             reach.slope = wp.vec3d()
             return reach
         if wp.abs(step) <= _CONVERGED:
-            certain = found.within_tolerance == 1 and speed < ZERO and speed * speed >= slowest
-            reach.grazing = wp.where(certain, 0, 1)
+            reach.grazing = wp.where(found.within_tolerance == 1 and speed < ZERO and speed * speed >= slowest, 0, 1)
             return reach
         reach.time = wp.clamp(t + step, found.toi, last)
     return reach

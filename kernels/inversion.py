@@ -24,17 +24,11 @@ _RESTRICTION = wp.constant(wp.float64(2.0))
 
 @wp.struct
 class Inversion:
-    """When a tetrahedron inverts first; if the status is UNSURE, it does not before ``toi``.
+    """When a tetrahedron inverts first; if the status is UNSURE, it does not before ``toi``."""
 
-    Attributes:
-        status: FREE, HIT (it inverts) or UNSURE.
-        toi: Time of inversion, a lower bound in [0, 1]; 2 where the status is FREE.
-        within_tolerance: 1 where the tetrahedron certainly inverts at most the tolerance after that time.
-    """
-
-    status: int
-    toi: wp.float64
-    within_tolerance: int
+    status: int  # FREE, HIT (it inverts) or UNSURE
+    toi: wp.float64  # time of inversion, a lower bound in [0, 1]; 2 where the status is FREE
+    within_tolerance: int  # 1 where the tetrahedron certainly inverts at most the tolerance after that time
 
 
 @wp.func

@@ -228,8 +228,7 @@ def relative_motion(
     size = motion.size
     if _out_of_range(a0, size):
         motion = _motion_of_kind(kind, _rescaled_query(query, size), roundoff)
-        in_range = size > _SMALLEST_WITH_GRADIENT and size < _ONE
-        motion.scale = wp.where(in_range, _LIFT * motion.scale, _ZERO)
+        motion.scale = wp.where(size > _SMALLEST_WITH_GRADIENT and size < _ONE, _LIFT * motion.scale, _ZERO)
     return motion
 
 

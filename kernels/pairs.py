@@ -26,14 +26,10 @@ class PairFilter:
     Two vertices meet if each has a group that is in the mask of the other. A pair of elements is left out unless each
     vertex of one meets each vertex of the other. So where a pair of an edge and a face is not left out, neither are
     those of their parts, whose contacts are the only way in which the two can come to cross.
-
-    Attributes:
-        group: Groups of each vertex, as bits.
-        mask: Groups that each vertex meets, as bits.
     """
 
-    group: wp.array[int]
-    mask: wp.array[int]
+    group: wp.array[int]  # of each vertex, as bits
+    mask: wp.array[int]  # groups that each vertex meets, as bits
 
 
 @wp.func

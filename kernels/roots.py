@@ -207,8 +207,7 @@ def quadratic_signs(
     constant = certified_sign_quadratic(q, q_bound)
     if constant != 0:
         return wp.vec2i(constant, constant)
-    leading = (q[2] - q[1]) - (q[1] - q[0])
-    chord_bound = q_bound + _QUARTER * (wp.abs(leading) + _SIX * q_bound)
+    chord_bound = q_bound + _QUARTER * (wp.abs((q[2] - q[1]) - (q[1] - q[0])) + _SIX * q_bound)
     signs = linear_signs(wp.vec2d(q[0], q[2]), chord_bound, k, bound, size, roots)
     if signs[0] != 0 and signs[1] != 0:
         return signs

@@ -104,6 +104,18 @@ def restrict_motion(motion: Motion, start: wp.float64, end: wp.float64) -> Motio
 
 
 @wp.func
+def verdict_between(motion: Motion, y: Coplanarity, axis: int, start: wp.float64, end: wp.float64) -> int:
+    """Returns the status wherever Y is zero over a part of the time, by the inside tests along an axis."""
+    tests = inside_tests(motion, y, axis)
+    tests.q0 = restrict_quadratic(tests.q0, start, end)
+    tests.q1 = restrict_quadratic(tests.q1, start, end)
+    tests.q2 = restrict_quadratic(tests.q2, start, end)
+    tests.q3 = restrict_quadratic(tests.q3, start, end)
+    tests.bounds = _QUADRATIC_ERROR * tests.bounds
+    return verdict(constant_signs(tests))
+
+
+@wp.func
 def status_between(motion: Motion, y: Coplanarity, k: wp.vec4d, start: wp.float64, end: wp.float64) -> int:
     """Returns the status over a part of the time: HIT if contact certainly occurs in it, FREE if certainly not.
 
@@ -121,13 +133,7 @@ def status_between(motion: Motion, y: Coplanarity, k: wp.vec4d, start: wp.float6
     w = HALF * (part.w0 + part.w1)
     axis = largest_axis(wp.cross(u, v))
     for attempt in range(3):
-        tests = inside_tests(motion, y, axis)
-        tests.q0 = restrict_quadratic(tests.q0, start, end)
-        tests.q1 = restrict_quadratic(tests.q1, start, end)
-        tests.q2 = restrict_quadratic(tests.q2, start, end)
-        tests.q3 = restrict_quadratic(tests.q3, start, end)
-        tests.bounds = _QUADRATIC_ERROR * tests.bounds
-        status = verdict(constant_signs(tests))
+        status = verdict_between(motion, y, axis, start, end)
         if status == FREE:
             return FREE
         if status == HIT:
@@ -324,7 +330,29 @@ def first_contact(motion: Motion, y: Coplanarity, status: int, tolerance: wp.flo
 
 
 @wp.func
-def impact(motion: Motion, y: Coplanarity, status: int, tolerance: wp.float64) -> Impact:
+def simple_contact(motion: Motion, y: Coplanarity, status: int, tolerance: wp.float64):
+    """Returns what :func:`first_contact` does, if that takes two intervals of a HIT query; else UNSURE.
+
+    The first interval, up to a root, is free by the sign of Y, and the second has a contact by its first axis.
+    """
+    length = power_of_two(clamped_tolerance(tolerance))
+    shortest = FINEST * length
+    bound = _CUBIC_ERROR * y.bound
+    start = shortest * wp.floor(approximate_contact_time(y.k) / shortest) - HALF * length
+    end = wp.min(start + length, ONE)
+    k = restrict_cubic(y.k, start, end)
+    part = restrict_motion(motion, start, end)
+    axis = largest_axis(wp.cross(HALF * (part.u0 + part.u1), HALF * (part.v0 + part.v1)))
+    found = status == HIT and start > ZERO and start < ONE - HALF * length
+    found = found and certified_sign(y.k[0], y.bound) != 0 and largest(y.k) > bound
+    found = found and certified_sign_cubic(restrict_cubic(y.k, ZERO, start), bound) != 0
+    found = found and certified_sign(k[0], bound) * certified_sign(k[3], bound) < 0
+    found = found and verdict_between(motion, y, axis, start, end) == HIT
+    return wp.where(found, HIT, UNSURE), start, end
+
+
+@wp.func
+def impact(motion: Motion, y: Coplanarity, status: int, tolerance: wp.float64, simple: bool = False) -> Impact:
     """Returns the first contact of a query that is HIT or UNSURE by classification.
 
     Args:
@@ -332,9 +360,16 @@ def impact(motion: Motion, y: Coplanarity, status: int, tolerance: wp.float64) -
         y: Coplanarity of the query.
         status: Status from classification.
         tolerance: Tolerance of the time of impact, as a share of the step, see :func:`clamped_tolerance`.
+        simple: Whether to search by :func:`simple_contact`; the result counts only if it is within the tolerance.
     """
     result = Impact()
-    found, toi, end = first_contact(motion, y, status, tolerance)
+    found = int(UNSURE)
+    toi = wp.float64(0.0)
+    end = wp.float64(1.0)
+    if not simple:
+        found, toi, end = first_contact(motion, y, status, tolerance)
+    else:
+        found, toi, end = simple_contact(motion, y, status, tolerance)
     if status == HIT and found == FREE:
         # possible only with signs that floating point computes, roundoff 0: then the only lower bound is 0
         found = UNSURE

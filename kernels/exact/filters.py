@@ -24,8 +24,7 @@ UNKNOWN = wp.constant(9)
 def _on_cpu(unknown: int, limbs: int, text: str) -> str:
     """Returns the text of a native function that computes with numbers on a CPU, and returns "unknown" on a GPU."""
     defined = definitions({"Integer": limbs_type(limbs)}, unknown=unknown)
-    numbers = header(__file__, "numbers.h")
-    return f"{defined}#if defined(__CUDA_ARCH__)\nreturn unknown;\n#else\n{numbers}{text}#endif\n"
+    return f"{defined}#if defined(__CUDA_ARCH__)\nreturn unknown;\n#else\n{header(__file__, 'numbers.h')}{text}#endif\n"
 
 
 _QUADRATIC_DISCRIMINANT = """

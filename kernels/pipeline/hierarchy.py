@@ -122,22 +122,13 @@ NOWHERE = wp.constant(wp.uint32(511 | (511 << 10) | (511 << 20)))
 
 @wp.struct
 class HierarchyLevel:
-    """The nodes of one level: faces by place, clusters or bundles.
+    """The nodes of one level: faces by place, which have coded boxes, or clusters or bundles, with boxes and flags."""
 
-    Attributes:
-        boxes: Box of each node, shape [n, 4], with lowest coordinates higher than the highest where there is no face;
-            no array for faces, whose boxes are :attr:`coded`.
-        flags: Those that a face of it has, see :data:`SOUGHT`; no array likewise.
-        coded: Box of each face in that of its cluster, see :func:`coded_box`, shape [n, 4]; no array for other levels.
-        first_world: Lowest world of the faces below; no array if all faces are in one world.
-        last_world: Highest world of the faces below.
-    """
-
-    boxes: wp.array2d[wp.vec3]
-    flags: wp.array[int]
-    coded: wp.array2d[wp.uint32]
-    first_world: wp.array[int]
-    last_world: wp.array[int]
+    boxes: wp.array2d[wp.vec3]  # of each node, shape [n, 4]; the lowest coordinates are the higher ones without a face
+    flags: wp.array[int]  # those that a face below has, see SOUGHT
+    coded: wp.array2d[wp.uint32]  # box of each face in that of its cluster, see coded_box, shape [n, 4]
+    first_world: wp.array[int]  # lowest world of the faces below; no array if all faces are in one world
+    last_world: wp.array[int]  # highest world of the faces below
 
 
 @wp.func

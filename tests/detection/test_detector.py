@@ -283,6 +283,20 @@ def test_capacities_for_a_number_of_pairs_a_face(n):
     assert pipeline.counts == other.counts
 
 
+@pytest.mark.parametrize("timed", [True, False])
+def test_two_passes_find_the_same_contacts(timed, device, monkeypatch):
+    """Of many contacts a GPU finds those first that take a short search."""
+    if device.is_cpu:
+        pytest.skip("a CPU searches many at once")
+    x0, x1, faces = crumpled(0, 48)
+    detector, found = bsc.CollisionDetector(bsc.CollisionMesh(faces, len(x0), device=device)), []
+    for many in (2**30, 0):
+        monkeypatch.setattr("warp_bsc.detection.narrow.rules.contact._MANY", many)
+        found.append(detector.detect(x0, x1, toi=timed))
+        assert found[-1].certified and len(found[-1].edge_edge) > 1000
+    assert_same(*found)
+
+
 def test_large_meshes_begin_with_room_for_fewer_contacts(monkeypatch):
     """Half as many survivors and contacts a face, from a number of pairs on; all are found, as queues grow."""
     x0, x1, faces = crumpled(0, 48)

@@ -14,7 +14,12 @@ from sample_sizes import cases
 import warp_bsc as bsc
 from warp_bsc import checker
 from warp_bsc.kernels import FREE, HIT, UNSURE
+from warp_bsc.kernels.classification import classify
 from warp_bsc.kernels.closest import between, closest_coordinates
+from warp_bsc.kernels.motion import relative_motion
+from warp_bsc.kernels.polynomials import coplanarity
+from warp_bsc.kernels.signs import ROUNDOFF
+from warp_bsc.kernels.time_of_impact import impact
 
 KINDS = ("vertex_face", "edge_edge")
 TRUTH = {"vertex_face": checker.vertex_face_toi, "edge_edge": checker.edge_edge_toi}
@@ -32,6 +37,26 @@ def find_closest(
     i = wp.tid()
     coordinates[i] = closest_coordinates(kind, uvw[i, 0], uvw[i, 1], uvw[i, 2])
     gap[i] = between(kind, coordinates[i], uvw[i, 0], uvw[i, 1], uvw[i, 2])
+
+
+@wp.kernel(enable_backward=False)
+def search(
+    kind: int,
+    tolerance: wp.float64,
+    x: wp.array2d[wp.vec3d],
+    status: wp.array2d[int],
+    times: wp.array2d[wp.vec2d],
+    contact: wp.array3d[wp.vec3d],
+):
+    i = wp.tid()
+    motion = relative_motion(kind, x[i, 0], x[i, 1], x[i, 2], x[i, 3], x[i, 4], x[i, 5], x[i, 6], x[i, 7], ROUNDOFF)
+    y = coplanarity(motion)
+    for simple in range(2):
+        found = impact(motion, y, classify(motion, y), tolerance, simple == 1)
+        status[simple, i] = found.status
+        times[simple, i] = wp.vec2d(found.toi, wp.float64(found.within_tolerance))
+        contact[simple, i, 0] = found.coordinates
+        contact[simple, i, 1] = found.normal
 
 
 def impacts(kind, points, tolerance=2.0**-20):
@@ -117,6 +142,24 @@ def test_contact_is_found_within_the_tolerance(kind, tolerance):
     assert (found.toi <= times[:, 1]).all()
     assert (found.toi >= times[:, 0] - tolerance)[within_tolerance].all()
     assert_exact_times(found.toi, tolerance)
+
+
+@pytest.mark.parametrize("generator", AIMED, ids=lambda generator: generator.__name__)
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("tolerance", [2.0**-10, 2.0**-30])
+def test_a_simple_search_that_finds_a_contact_finds_that_of_the_whole_one(kind, generator, tolerance):
+    """Bit for bit: a GPU that searches in two passes finds what a CPU does."""
+    points = generator(np.random.default_rng(2), cases(2000), kind, np.float64)
+    x = wp.array(points, dtype=wp.vec3d)
+    outputs = [wp.zeros((2, len(points)), dtype=dtype) for dtype in (int, wp.vec2d)]
+    outputs.append(wp.zeros((2, len(points), 2), dtype=wp.vec3d))
+    wp.launch(search, len(points), inputs=[kind == "edge_edge", tolerance, x], outputs=outputs)
+    status, times, contact = (values.numpy() for values in outputs)
+    simple = times[1, :, 1] == 1.0
+    for values in (status, times, contact):
+        np.testing.assert_array_equal(values[1, simple], values[0, simple])
+    if generator is mostly_hits:
+        assert 0.3 < simple.mean() < 1.0
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -16,48 +16,29 @@ _MAX_FREE = 4
 
 @wp.struct
 class ContactBuffer:
-    """Pairs that no cull decides, one a row, and their contacts; all arrays have the same length.
+    """Pairs that no cull decides, one a row, and their contacts; all arrays have the same length."""
 
-    Attributes:
-        pairs: (vertex, face) or (edge, edge).
-        status: What floating point certifies: FREE, HIT or UNSURE.
-        decided: The status after the exact phase, or HIT where features certainly touch; UNSURE if left to the host.
-        within_tolerance: Whether the time of impact is within the tolerance.
-        toi: Time of impact as a share of the step.
-        coordinates: Contact coordinates.
-        normal: Unit contact normals.
-    """
-
-    pairs: wp.array[wp.vec2i]
-    status: wp.array[wp.int8]
+    pairs: wp.array[wp.vec2i]  # (vertex, face) or (edge, edge)
+    status: wp.array[wp.int8]  # what floating point certifies: FREE, HIT or UNSURE
+    # the status after the exact phase, or HIT where features certainly touch; UNSURE if left to the host
     decided: wp.array[wp.int8]
-    within_tolerance: wp.array[wp.bool]
-    toi: wp.array[wp.float64]
-    coordinates: wp.array[wp.vec3d]
-    normal: wp.array[wp.vec3d]
+    within_tolerance: wp.array[wp.bool]  # whether the time of impact is within the tolerance
+    toi: wp.array[wp.float64]  # time of impact as a share of the step
+    coordinates: wp.array[wp.vec3d]  # contact coordinates
+    normal: wp.array[wp.vec3d]  # unit contact normals
 
 
 @dataclass
 class HostContacts:
-    """The rows of a :class:`ContactBuffer` as NumPy arrays, by the same names.
+    """The rows of a :class:`ContactBuffer` as NumPy arrays, by the same names."""
 
-    Attributes:
-        pairs: int32, shape [n, 2].
-        status: int8, shape [n].
-        decided: int8, shape [n].
-        within_tolerance: bool, shape [n].
-        toi: float64, shape [n].
-        coordinates: float64, shape [n, 3].
-        normal: float64, shape [n, 3].
-    """
-
-    pairs: np.ndarray
-    status: np.ndarray
-    decided: np.ndarray
-    within_tolerance: np.ndarray
-    toi: np.ndarray
-    coordinates: np.ndarray
-    normal: np.ndarray
+    pairs: np.ndarray  # int32, shape [n, 2]
+    status: np.ndarray  # int8, shape [n]
+    decided: np.ndarray  # int8, shape [n]
+    within_tolerance: np.ndarray  # bool, shape [n]
+    toi: np.ndarray  # float64, shape [n]
+    coordinates: np.ndarray  # float64, shape [n, 3]
+    normal: np.ndarray  # float64, shape [n, 3]
 
     @property
     def hit(self) -> np.ndarray:

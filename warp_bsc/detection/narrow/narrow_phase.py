@@ -109,7 +109,8 @@ class NarrowPhase:
         buffers = PairBuffers()
         buffers.elements, buffers.counts = elements, self.counts
         buffers.queue, buffers.survivors, buffers.contacts = self.queue, self._survivors, self.contacts
-        buffers.keys, buffers.order, buffers.for_exact = self._keys, self._order, self._for_exact[0]
+        buffers.keys, buffers.order = self._keys, self._order
+        buffers.for_exact, buffers.for_search = self._for_exact
         buffers.second_bits, buffers.last_key = self._bits[1], self._last_key
         return buffers
 

@@ -20,31 +20,19 @@ from .contact_buffer import ContactBuffer
 
 @wp.struct
 class PairBuffers:
-    """The pairs of one kind in all phases of the narrow phase; without arrays there are none.
+    """The pairs of one kind in all phases of the narrow phase; without arrays there are none."""
 
-    Attributes:
-        elements: Vertex indices of the faces or edges.
-        counts: Counts by :class:`Count`.
-        queue: The pairs to decide.
-        survivors: Pairs that no cull decides.
-        contacts: Survivors that classification does not certify free.
-        keys: Sorting keys of the contacts.
-        order: Indices of the contacts, to be sorted by their keys.
-        for_exact: Indices of contacts for the exact phase, or for subdivision with a minimum distance.
-        second_bits: Bits of the second element in a key.
-        last_key: Key of rows that are no contacts, greater than those of contacts.
-    """
-
-    elements: wp.array2d[int]
-    counts: wp.array[wp.int64]
-    queue: wp.array[wp.vec2i]
-    survivors: wp.array[wp.vec2i]
-    contacts: ContactBuffer
-    keys: wp.array[wp.int64]
-    order: wp.array[int]
-    for_exact: wp.array[int]
-    second_bits: int
-    last_key: wp.int64
+    elements: wp.array2d[int]  # vertex indices of the faces or edges
+    counts: wp.array[wp.int64]  # by Count
+    queue: wp.array[wp.vec2i]  # the pairs to decide
+    survivors: wp.array[wp.vec2i]  # pairs that no cull decides
+    contacts: ContactBuffer  # survivors that classification does not certify free
+    keys: wp.array[wp.int64]  # sorting keys of the contacts
+    order: wp.array[int]  # indices of the contacts, to be sorted by their keys
+    for_exact: wp.array[int]  # contacts for the exact phase, or for subdivision with a minimum distance
+    for_search: wp.array[int]  # contacts whose times of impact take a longer search
+    second_bits: int  # bits of the second element in a key
+    last_key: wp.int64  # of rows that are no contacts, greater than those of contacts
 
 
 @wp.func

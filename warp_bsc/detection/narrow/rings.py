@@ -16,15 +16,10 @@ _MAX_PAIRS = 2**22
 
 @wp.struct
 class Rings:
-    """The other vertices within a number of edges of each vertex; without arrays there are none.
+    """The other vertices within a number of edges of each vertex; without arrays there are none."""
 
-    Attributes:
-        starts: Where those of each vertex start in ``neighbours``, and its length at last.
-        neighbours: The vertices.
-    """
-
-    starts: wp.array[int]
-    neighbours: wp.array[int]
+    starts: wp.array[int]  # where those of each vertex start in ``neighbours``, and its length at last
+    neighbours: wp.array[int]  # the vertices
 
 
 @wp.func

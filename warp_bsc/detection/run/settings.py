@@ -100,7 +100,8 @@ class Count(enum.IntEnum):
         TOO_WIDE_8: Pairs of the exact phase whose exponents are too far apart for eight limbs or, with a minimum
             distance, that it does not decide: delegated to the host.
         REFUTED: Found pairs that the exact phase decides to be free.
-        SUBDIVIDED: Contacts with a minimum distance that advancement leaves to subdivision.
+        SUBDIVIDED: Contacts with a minimum distance that advancement leaves to subdivision; of many others on a GPU,
+            those that a simple search does.
         FILTERED: Pairs that would be candidates, but are left out by groups and masks.
     """
 

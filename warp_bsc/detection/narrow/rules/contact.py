@@ -13,11 +13,11 @@ from ....kernels.arcs import Arcs, turns
 from ....kernels.classification import classify
 from ....kernels.culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart
 from ....kernels.motion import edge_edge_motion, relative_motion, vertex_face_motion
-from ....kernels.pairs import ends_of
+from ....kernels.pairs import ends_of, points_of_pair
 from ....kernels.pipeline.batch_classification import BATCH as CLASSIFIED
 from ....kernels.pipeline.batch_culling import BATCH as CULLED
 from ....kernels.pipeline.batch_impacts import BATCH as DECIDED
-from ....kernels.pipeline.queues import take_slot
+from ....kernels.pipeline.queues import is_filled, take_slot
 from ....kernels.polynomials import VERTEX_FACE, Motion, coplanarity
 from ....kernels.signs import FREE, HIT, ROUNDOFF, UNSURE, certified_sign_cubic
 from ....kernels.time_of_impact import Impact, impact
@@ -31,7 +31,6 @@ from ..pair_kernels import (
     PairRule,
     add_open_contact,
     count_found,
-    entry_of_two,
     write_decision,
     write_impact,
 )
@@ -89,22 +88,48 @@ def _decide(options: Options, kind: int, v: wp.vec4i, x0: wp.array[Any], x1: wp.
 _RULE = PairRule(Options, _excludes, _clears, _decide, add=add_open_contact, culls_by_kind=True, max_registers=128)
 
 
+_MANY = 2**16
+"""Contacts, if there is room for more, whose times a GPU finds in two passes: most need a short search."""
+
+
 @wp.func
-def _finish(i: int, status: int, timed: bool, buffers: PairBuffers):
+def _contact_at(i: int, queued: bool, kind: int, buffers: PairBuffers):
+    """Returns the row, the status and the vertices of a contact, or of one that is left to the search; -1 for none."""
+    row = i
+    count = wp.where(queued, int(Count.SUBDIVIDED), int(Count.CONTACTS))
+    if not is_filled(i, buffers.contacts.pairs, buffers.counts, count):
+        return -1, 0, wp.vec4i()
+    if queued:
+        row = buffers.for_search[i]
+    vertices = points_of_pair(kind, buffers.elements, buffers.contacts.pairs[row])
+    return row, int(buffers.contacts.status[row]), vertices
+
+
+@wp.func
+def _finish(i: int, result: Impact, is_sought: bool, timed: bool, simple: bool, buffers: PairBuffers):
     """Writes and counts what is decided of a contact, and enqueues it for the exact phase if that is needed."""
-    write_decision(i, status, buffers)
-    if status == FREE:
+    if is_sought:
+        if simple and result.within_tolerance == 0:
+            buffers.for_search[wp.int32(take_slot(buffers.counts, Count.SUBDIVIDED))] = i
+            return
+        write_impact(i, result, buffers)
+    write_decision(i, result.status, buffers)
+    if result.status == FREE:
         return
-    count_found(status, buffers)
-    if status == UNSURE or (timed and not buffers.contacts.within_tolerance[i]):
+    count_found(result.status, buffers)
+    if result.status == UNSURE or (timed and not buffers.contacts.within_tolerance[i]):
         buffers.for_exact[wp.int32(take_slot(buffers.counts, Count.FOR_EXACT))] = i
 
 
 @made_once
-def _impact_kernel(dtype: type) -> wp.Kernel:
-    """Returns the kernel that finds the times of impact of contacts on a GPU, for one type of position."""
+def _impact_kernel(dtype: type, simple: bool) -> wp.Kernel:
+    """Returns the kernel that finds the times of impact of contacts on a GPU, for one type of position.
 
-    @wp.kernel(**NO_FUSED_OPERATIONS)
+    That for ``simple`` ones is for all contacts. The other one is too, or for those that it has ``queued``.
+    """
+    limits = {"cuda_max_registers": 128} if simple else {}
+
+    @wp.kernel(**NO_FUSED_OPERATIONS, **limits)
     def find_impacts(
         first: int,
         # mesh
@@ -114,34 +139,36 @@ def _impact_kernel(dtype: type) -> wp.Kernel:
         roundoff: wp.float64,
         timed: bool,
         tolerance: wp.float64,
+        queued: bool,
         kinds: wp.vec2i,
         # in and out
         one: PairBuffers,
         other: PairBuffers,
     ):
-        kind, i, v = entry_of_two(
-            first + wp.tid(), kinds, one.contacts.pairs, other.contacts.pairs, one, other, Count.CONTACTS
-        )
-        if v[0] < 0:
-            return
+        i = first + wp.tid()
+        is_one = i < one.contacts.pairs.shape[0]
+        kind = kinds[0]
+        row = int(-1)
         status = int(0)
-        if kind == kinds[0]:
-            status = int(one.contacts.status[i])
-        if kind != kinds[0]:  # one expression would read both
-            status = int(other.contacts.status[i])
-        if timed or status != HIT:
+        v = wp.vec4i()
+        if is_one:
+            row, status, v = _contact_at(i, queued, kind, one)
+        else:
+            kind = kinds[1]
+            row, status, v = _contact_at(i - one.contacts.pairs.shape[0], queued, kind, other)
+        if row < 0:
+            return
+        result = Impact()
+        result.status = status
+        is_sought = timed or status != HIT
+        if is_sought:
             a0, b0, c0, d0, a1, b1, c1, d1 = ends_of(x0, x1, v)
             motion = relative_motion(kind, a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
-            result = impact(motion, coplanarity(motion), status, tolerance)
-            status = result.status
-            if kind == kinds[0]:
-                write_impact(i, result, one)
-            else:
-                write_impact(i, result, other)
-        if kind == kinds[0]:
-            _finish(i, status, timed, one)
+            result = impact(motion, coplanarity(motion), status, tolerance, wp.static(simple))
+        if is_one:
+            _finish(row, result, is_sought, timed, wp.static(simple), one)
         else:
-            _finish(i, status, timed, other)
+            _finish(row, result, is_sought, timed, wp.static(simple), other)
 
     return find_impacts
 
@@ -205,8 +232,11 @@ def run_contacts(
         if is_cpu:
             launch_batches(batch_impact_kernel, [timed, tolerance], "for_exact", Count.CONTACTS, DECIDED)
         else:
-            kernel, inputs = _impact_kernel(x0.dtype), [*motion, timed, tolerance]
-            launch_over_kinds(kernel, buffers, "for_exact", Count.CONTACTS, inputs=inputs, block_dim=32)
+            are_many = max(len(phase.contacts.pairs) for phase, _elements in phases) > _MANY
+            for simple in [True, False] if are_many else [False]:
+                kernel = _impact_kernel(x0.dtype, simple)
+                inputs = [*motion, timed, tolerance, are_many and not simple]
+                launch_over_kinds(kernel, buffers, "for_exact", Count.CONTACTS, inputs=inputs, block_dim=32)
     if method == "exact":
         with timer.phase("exact"):
             for phase, elements in phases:
