@@ -58,8 +58,6 @@ class CollisionMesh:
             is the largest one of its vertices.
         face_edges: Edges of the faces, edge i from corner i to the next, -1 where both are one vertex, int32, shape
             [face_count, 3].
-        owned: What each face is the representative of, see :mod:`warp_bsc.kernels.pairs`, int32, shape
-            [face_count].
         tets: Vertex indices of the tetrahedra, int32, shape [tet_count, 4].
         vertices: Indices of the vertices that faces and edges use, and of the points, sorted, int32, shape
             [used_vertex_count].
@@ -144,19 +142,12 @@ class CollisionMesh:
         self.edges = all_edges[proper]
         face_edges = np.where(proper, np.cumsum(proper) - 1, -1)[edge_of_side.ravel()[: len(sides)]].reshape(-1, 3)
         self.free_edges = np.flatnonzero(first_sides[proper] >= len(sides)).astype(np.int32)
-        first_corner = np.full(self.vertex_count, -1)
-        first_corner[self.faces.ravel()[::-1]] = np.arange(self.faces.size)[::-1]  # the last one written stays
-        first_corners = first_corner[first_corner >= 0]
-        is_used = first_corner >= 0
-        is_used[given_edges] = True
+        is_used = np.zeros(self.vertex_count, dtype=bool)
+        is_used[self.faces] = is_used[given_edges] = True
         self.points = np.unique(given_points[~is_used[given_points]])
         is_used[self.points] = True
         self.vertices = np.flatnonzero(is_used).astype(np.int32)
-        # the representative of an element is the first face that has it: bits 0 to 2 corners, 3 to 5 edges
-        first_sides = first_sides[proper & (first_sides < len(sides))]
-        bits = np.append(1 << (first_corners % 3), 8 << (first_sides % 3))
-        owned = np.bincount(np.append(first_corners, first_sides) // 3, bits, len(self.faces))
-        self.face_edges, self.owned = face_edges.astype(np.int32), owned.astype(np.int32)
+        self.face_edges = face_edges.astype(np.int32)
         self.device_vertices = wp.array(self.vertices, dtype=int, device=self.device)
         self.device_faces = wp.array(self.faces, dtype=int, device=self.device)
         self.device_edges = wp.array(self.edges, dtype=int, device=self.device)
@@ -196,16 +187,27 @@ class CollisionMesh:
         cell_edges[len(self.faces) : len(self.faces) + len(self.free_edges), 0] = self.free_edges
         return cell_edges
 
-    @functools.cached_property
-    def cell_owned(self) -> np.ndarray:
-        """What each cell is the representative of, as ``owned``, and :data:`IS_FACE`, int32, shape [n]."""
+    @property
+    def rows(self) -> np.ndarray:
+        """The cells as a GPU pairs their elements, int32, shape [n, 7]: vertices, what each represents, and its edges.
+
+        A row begins with its smallest vertex, so that the first two sides of a face have all edges that its neighbours
+        have as their last one. The representative of an element is a face in which it comes early: hardly any face
+        represents more than a corner and two sides, and threads that compare them seldom wait for others.
+        """
         first, last = len(self.faces), len(self.faces) + len(self.free_edges)
-        owned = np.concatenate([self.owned | IS_FACE, np.full(last - first, 8), np.ones(len(self.points))])
-        owned = owned.astype(np.int32)
-        ends, first_ends = np.unique(self.cells[first:last, :2], return_index=True)
+        order = (np.argmin(self.cells, axis=1)[:, None] + np.arange(3)) % 3
+        cells, edges = (np.take_along_axis(values, order, axis=1) for values in (self.cells, self.cell_edges))
+        owned = np.repeat([IS_FACE, 8, 1], [first, last - first, len(self.points)])
+        for elements, count, bit in ((cells, self.vertex_count, 1), (edges, len(self.edges), 8)):
+            earliest = np.full(count + 1, -1)  # the last one is none
+            earliest[elements[:first].T.ravel()[::-1]] = np.arange(3 * first)[::-1]  # the last one written stays
+            earliest = earliest[:-1][earliest[:-1] >= 0]
+            np.bitwise_or.at(owned, earliest % first, bit << (earliest // first))
+        ends, first_ends = np.unique(cells[first:last, :2], return_index=True)
         first_ends = first_ends[~np.isin(ends, self.faces)]
         np.bitwise_or.at(owned, first + first_ends // 2, 1 << (first_ends % 2))
-        return owned
+        return np.column_stack([cells, owned, edges]).astype(np.int32)
 
     @functools.cached_property
     def edge_faces(self) -> ElementsOfParts:
@@ -246,9 +248,8 @@ class CollisionMesh:
         The cell, -1 for none; its vertices, and what it is the representative of, shape [n, 4]; its edges, [n, 3].
         """
         order = self.face_order
-        of_cells = np.column_stack([self.cells, self.cell_owned]), self.cell_edges
-        by_place = [values[order] if len(order) else values for values in of_cells]
-        arrays = (values.astype(np.int32, copy=False) for values in (order, *by_place))
+        rows = self.rows[order] if len(order) else self.rows
+        arrays = (order, rows[:, :4], rows[:, 4:])
         return tuple(wp.array(values, dtype=int, device=self.device) for values in arrays)
 
     @functools.cached_property

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import trimesh
 import warp as wp
 from hypothesis import example, given
 from hypothesis import strategies as st
@@ -274,6 +275,25 @@ def test_pairs_of_faces_of_which_one_has_changed():
         changes = (changed[mesh.faces] != 0).any(axis=1)
         expected = everything[changes[everything].any(axis=1)]
         assert_contains(face_pairs(mesh, x0, x1, changed), expected)
+
+
+def test_no_face_of_a_closed_surface_represents_its_last_side():
+    """Nor does another face represent what one has: numbers of vertices and the order of faces are random."""
+    random = np.random.default_rng(0)
+    sphere = trimesh.creation.icosphere(3)
+    faces = random.permutation(len(sphere.vertices))[random.permutation(sphere.faces)]
+    faces = np.stack([np.roll(face, turn) for face, turn in zip(faces, random.integers(0, 3, len(faces)), strict=True)])
+    mesh = bsc.CollisionMesh(faces, len(sphere.vertices), edges=[[0, 200]])
+    cells, owned, edges = np.split(mesh.rows, [3, 4], axis=1)
+    assert (cells[:, 0] == mesh.cells.min(axis=1)).all()
+    for j in range(3):
+        ends = np.sort(cells[:, [j, (j + 1) % 3]], axis=1)
+        assert (mesh.edges[edges[:-1, j]] == ends[:-1]).all()
+    for elements, count, first in ((cells, mesh.vertex_count, 0), (edges, len(mesh.edges), 3)):
+        is_owned = (owned >> np.arange(first, first + 3)) & 1 == 1
+        assert (np.sort(elements[is_owned]) == np.arange(count)).all()
+        assert not is_owned[:-1, 2].any()
+    assert (owned[:-1] & 8 != 0).all()
 
 
 def test_simd_packets_leave_out_pairs_within_a_rigid_body():

@@ -169,13 +169,14 @@ def pair_functions(padded: bool, swept: bool) -> PairFunctions:
         return found
 
     @wp.func
-    def sides_near(a: Cell, box: BoxRows) -> int:
-        """Returns which sides no axis separates from a box, as bits."""
+    def sides_near(a: Cell, sought: int, box: BoxRows) -> int:
+        """Returns which of some sides no axis separates from a box, as bits."""
         found = int(0)
         for i in range(3):
-            if not are_apart(edge_box(a.corners, i, (i + 1) % 3, wp.static(swept)), box):
-                found = found | (1 << i)
-        return found
+            if i < 2 or sought >= 4:  # of hardly any face the last one
+                if not are_apart(edge_box(a.corners, i, (i + 1) % 3, wp.static(swept)), box):
+                    found = found | (1 << i)
+        return sought & found
 
     @wp.func
     def corners_with_face(a: Cell, b: Cell) -> int:
@@ -191,7 +192,7 @@ def pair_functions(padded: bool, swept: bool) -> PairFunctions:
         sought = (a.elements >> 3) & 7 & ~_sides_at(common_corners(a, b))
         if sought == 0 or b.elements & IS_FACE == 0:
             return 0
-        return sought & sides_near(a, face_box(b.corners, wp.static(swept)))
+        return sides_near(a, sought, face_box(b.corners, wp.static(swept)))
 
     @wp.func
     def vertex_face_pairs(mesh: FaceHierarchy, place: int, other: int) -> int:
@@ -215,7 +216,7 @@ def pair_functions(padded: bool, swept: bool) -> PairFunctions:
             sought = (b.elements >> 3) & 7 & ~_sides_at(common)
             if (a.elements >> (3 + i)) & 1 == 1 and sought != 0:
                 box = edge_box(a.corners, i, (i + 1) % 3, wp.static(swept))
-                found = found | ((sought & sides_near(b, box)) << (6 + 3 * i))
+                found = found | (sides_near(b, sought, box) << (6 + 3 * i))
         return found
 
     @wp.func
@@ -287,7 +288,7 @@ def pair_elements_kernel(padded: bool, swept: bool) -> wp.Kernel:
                 write(wp.vec2i(wp.min(edge, other_edge), wp.max(edge, other_edge)), edge_edge.pairs, edge_edge_slot)
                 edge_edge_slot += wp.int64(1)
 
-    @wp.kernel(**NO_GRADIENTS)
+    @wp.kernel(**NO_GRADIENTS, cuda_max_registers=96)
     def pair_elements(mesh: FaceHierarchy, face_pairs: Pairs, vertex_face: Pairs, edge_edge: Pairs, threads: int):
         i = wp.tid()
         count = filled_entries(face_pairs.pairs, face_pairs.counts, 0)

@@ -67,40 +67,25 @@ class FaceHierarchy:
 
     Boxes are rows of four: the lowest and the highest coordinates at the start, then at the end; or twice those over
     the time of the motion, if pairs that an axis separates at both ends are sought as well.
-
-    Attributes:
-        only_free: Whether pairs of two faces are left out.
-        pair_filter: Pairs of elements that are left out.
-        filtered_of_worlds: How many of them each world has; without an array they are not counted by world.
-        face_count: Number of faces; greater cells are edges.
-        point_start: First cell that is a point.
-        order: Cell at each place, -1 for none.
-        faces: Vertices of the cell at each place, and what it represents, see :mod:`warp_bsc.kernels.pipeline.corners`.
-        face_edges: Edges of the face at each place.
-        edges: Vertices of each edge.
-        corners: Rows of vertices, or with a padding those of the cell at each place.
-        swept: Whether boxes are those over the time of the motion.
-        places: Level of the faces; where a position is not finite, boxes cover the others.
-        clusters: Level above.
-        bundles: Level above the clusters; without arrays in a small mesh, where all are traversed.
-        groups: Level above the bundles; without arrays likewise.
     """
 
-    only_free: wp.bool
-    pair_filter: PairFilter
+    only_free: wp.bool  # whether pairs of two faces are left out
+    pair_filter: PairFilter  # pairs of elements that are left out
+    # how many of them each world has; without an array they are not counted by world
     filtered_of_worlds: wp.array[wp.int64]
-    face_count: int
-    point_start: int
-    order: wp.array[int]
+    face_count: int  # number of faces; greater cells are edges
+    point_start: int  # first cell that is a point
+    order: wp.array[int]  # cell at each place, -1 for none
+    # vertices of the cell at each place, and what it represents, see :mod:`warp_bsc.kernels.pipeline.corners`
     faces: wp.array2d[int]
-    face_edges: wp.array2d[int]
-    edges: wp.array2d[int]
-    corners: wp.array2d[wp.float32]
-    swept: wp.bool
-    places: HierarchyLevel
-    clusters: HierarchyLevel
-    bundles: HierarchyLevel
-    groups: HierarchyLevel
+    face_edges: wp.array2d[int]  # edges of the face at each place
+    edges: wp.array2d[int]  # vertices of each edge
+    corners: wp.array2d[wp.float32]  # rows of vertices, or with a padding those of the cell at each place
+    swept: wp.bool  # whether boxes are those over the time of the motion
+    places: HierarchyLevel  # level of the faces; where a position is not finite, boxes cover the others
+    clusters: HierarchyLevel  # level above
+    bundles: HierarchyLevel  # level above the clusters; without arrays in a small mesh, where all are traversed
+    groups: HierarchyLevel  # level above the bundles; without arrays likewise
 
 
 @made_once
