@@ -12,26 +12,18 @@ from ..._profiling import phase
 
 @dataclass(frozen=True)
 class StepCall:
-    """A call of a stage's ``step``, or of one of its substeps.
-
-    Attributes:
-        state_in, state_out, control, contacts, dt: As of :meth:`.stage.CollisionStage.step`.
-        options: More for the inner solver.
-        mask: Which worlds take part, None for all.
-        tape: The active tape if the model requires gradients, else None.
-        number, count: The number of the substep, from 0, and how many there are.
-    """
+    """A call of :meth:`.stage.CollisionStage.step`, whose arguments the first five are, or of one of its substeps."""
 
     state_in: newton.State
     state_out: newton.State
     control: newton.Control | None
     contacts: newton.Contacts | None
     dt: float
-    options: dict[str, Any] = field(default_factory=dict)
-    mask: wp.array[wp.bool] | None = None
-    tape: wp.Tape | None = None
-    number: int = 0
-    count: int = 1
+    options: dict[str, Any] = field(default_factory=dict)  # more for the inner solver
+    mask: wp.array[wp.bool] | None = None  # which worlds take part, None for all
+    tape: wp.Tape | None = None  # the active one if the model requires gradients
+    number: int = 0  # of the substep
+    count: int = 1  # of substeps
 
     @property
     def is_recorded(self) -> bool:

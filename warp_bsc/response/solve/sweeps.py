@@ -95,9 +95,11 @@ def excess_speed(step: Step, i: int) -> wp.float64:
     normal = step.constraints.normal[i]
     weights = step.constraints.weights[i]
     corners = step.constraints.vertices[i]
-    predicted = wp.dot(normal, relative(weights, corners, step.motion.velocity))
     speed = wp.dot(normal, relative(weights, corners, step.vertices.velocity))
-    return speed - wp.float64(step.restitution[0]) * wp.max(-predicted, ZERO)
+    if step.restitution[0] > 0.0:  # else what is predicted is not read
+        predicted = wp.dot(normal, relative(weights, corners, step.motion.velocity))
+        speed -= wp.float64(step.restitution[0]) * wp.max(-predicted, ZERO)
+    return speed
 
 
 @wp.func
@@ -110,7 +112,7 @@ def velocity_multiplier_after(step: Step, i: int) -> wp.vec3d:
     velocity = relative(step.constraints.weights[i], step.constraints.vertices[i], step.vertices.velocity)
     friction = wp.float64(step.constraints.friction[i])
     excess = excess_speed(step, i)
-    least = resisted_push(step, i)
+    least = step.constraints.resisted[i]
     return _multiplier_after(old, step.constraints.normal[i], excess, velocity, along, across, friction, least)
 
 

@@ -39,6 +39,7 @@ def _initialize_multiplier(step: Step, i: int):
     if has_pushed(step, i):
         impulse = sweeps.initial_velocity_multiplier(step, i)
         constraints.velocity_multiplier[i] = impulse
+        constraints.resisted[i] = sweeps.resisted_push(step, i)
         for j in range(4):
             vertices.active[constraints.vertices[i][j]] = 1
         if step.motion.bodies.of_vertex:
@@ -67,7 +68,7 @@ def _is_active(step: Step, tolerance: wp.float64, i: int) -> bool:
     tolerance = wp.where(moves_body(step, i), TOLERANCE_OF_BODIES, ONE) * tolerance / step.dt
     excess = sweeps.excess_speed(step, i)
     active = excess < -tolerance
-    least = sweeps.resisted_push(step, i)
+    least = constraints.resisted[i]
     if not active and (acts or least > ZERO):
         velocity = relative(constraints.weights[i], constraints.vertices[i], step.vertices.velocity)
         friction = wp.float64(constraints.friction[i])

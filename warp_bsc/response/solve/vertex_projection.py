@@ -1,5 +1,7 @@
 """Projects a vertex onto its sides of dividing planes, which :mod:`.plane_placement` places.
 
+Loops over the list of a vertex read the next node before they use the plane of this one: a GPU waits for both at once.
+
 References:
     D. Goldfarb and A. Idnani, A Numerically Stable Dual Method for Solving Strictly Convex Quadratic Programs,
     Mathematical Programming 27, 1983, doi:10.1007/BF02591962.
@@ -40,9 +42,9 @@ def _is_above(planes: DividingPlanes, vertex: int, x: wp.vec3d) -> bool:
     node = planes.first[vertex]
     while node >= 0:
         normal, least, _margin = _half_space(planes, node)
+        node = planes.next[node / 2]
         if wp.dot(normal, x) <= least:
             return False
-        node = planes.next[node / 2]
     return True
 
 
@@ -101,13 +103,13 @@ def _projected(planes: DividingPlanes, vertex: int, x: wp.vec3d) -> wp.vec3d:
             node = planes.first[vertex]
             while node >= 0:
                 other, least, margin = _half_space(planes, node)
+                node = planes.next[node / 2]
                 missing = least + margin - wp.dot(other, x)
                 if missing >= margin and missing >= most:
                     if missing > most or _precedes(other, normal):
                         most = missing
                         normal = other
                         height = least + margin
-                node = planes.next[node / 2]
             if most == ZERO:
                 return x
             joins = True
@@ -149,11 +151,11 @@ def share_of_path(planes: DividingPlanes, vertex: int, x0: wp.vec3d, x1: wp.vec3
     node = planes.first[vertex]
     while node >= 0:
         normal, least, margin = _half_space(planes, node)
+        node = planes.next[node / 2]
         before = wp.dot(normal, x0) - least
         after = wp.dot(normal, x1) - least
         if after <= ZERO and before > after:
             share = wp.min(share, wp.max(before - margin, ZERO) / (before - after))
-        node = planes.next[node / 2]
     return share
 
 
@@ -178,11 +180,11 @@ def _rounded(planes: DividingPlanes, vertex: int, x: wp.vec3d) -> wp.vec3:
     node = planes.first[vertex]
     while node >= 0:
         other, least, _margin = _half_space(planes, node)
+        node = planes.next[node / 2]
         missing = least - wp.dot(other, to_double(end))
         if missing > most or (missing == most and _precedes(other, normal)):
             most = missing
             normal = other
-        node = planes.next[node / 2]
     for axis in range(3):
         end[axis] = _towards(end[axis], x[axis], normal[axis])
     return end
@@ -200,8 +202,8 @@ def _most_correction(planes: DividingPlanes, vertex: int, start: wp.vec3d, end: 
     node = planes.first[vertex]
     while node >= 0:
         normal, least, margin = _half_space(planes, node)
-        below = wp.max(below, least + margin - wp.dot(normal, start))
         node = planes.next[node / 2]
+        below = wp.max(below, least + margin - wp.dot(normal, start))
     return (ONE + _ROUNDING) * wp.length(end - start) + WEDGE * below
 
 

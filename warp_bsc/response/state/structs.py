@@ -168,6 +168,7 @@ class Constraints:
     pace: wp.array[int]  # a Pace
     position_multiplier: wp.array[wp.vec3d]  # [kg m]
     velocity_multiplier: wp.array[wp.vec3d]  # [kg m/s]
+    resisted: wp.array[wp.float64]  # impulse of its push in positions if that is resisted, see sweeps.resisted_push
     previous_multiplier: wp.array[wp.vec3d]  # either of the two after the last sweep, without momentum
     last_sweep: wp.array[int]  # in which it was active last, or NEVER_SWEPT
     active_set: wp.array[int]  # indices of the active constraints; if worlds are swept apart, from ``first`` of each
