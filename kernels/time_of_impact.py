@@ -344,7 +344,6 @@ def simple_contact(motion: Motion, y: Coplanarity, status: int, tolerance: wp.fl
     part = restrict_motion(motion, start, end)
     axis = largest_axis(wp.cross(HALF * (part.u0 + part.u1), HALF * (part.v0 + part.v1)))
     found = status == HIT and start > ZERO and start < ONE - HALF * length
-    found = found and certified_sign(y.k[0], y.bound) != 0 and largest(y.k) > bound
     found = found and certified_sign_cubic(restrict_cubic(y.k, ZERO, start), bound) != 0
     found = found and certified_sign(k[0], bound) * certified_sign(k[3], bound) < 0
     found = found and verdict_between(motion, y, axis, start, end) == HIT
