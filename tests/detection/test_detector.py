@@ -12,10 +12,11 @@ import warp_bsc as bsc
 from warp_bsc import checker
 from warp_bsc.detection.at_rest.intersections import find_intersections
 from warp_bsc.detection.broad.broad_phase_hierarchy import BroadPhaseHierarchy
+from warp_bsc.detection.narrow.rules import contact
 from warp_bsc.detection.pipeline import DetectionPipeline
 from warp_bsc.detection.results.collision_finder import CollisionFinder
 from warp_bsc.detection.run.launch import retry_until_fits
-from warp_bsc.detection.run.settings import Count
+from warp_bsc.detection.run.settings import Count, PairKind
 from warp_bsc.kernels.signs import FREE
 
 METHODS = ("float", "conservative", "exact")
@@ -283,18 +284,20 @@ def test_capacities_for_a_number_of_pairs_a_face(n):
     assert pipeline.counts == other.counts
 
 
-@pytest.mark.parametrize("timed", [True, False])
-def test_two_passes_find_the_same_contacts(timed, device, monkeypatch):
-    """Of many contacts a GPU finds those first that take a short search."""
-    if device.is_cpu:
-        pytest.skip("a CPU searches many at once")
+def test_two_passes_find_the_same_contacts(device, monkeypatch):
+    """The kernels of a GPU, on a CPU as well: of many contacts they find those first that take a short search."""
     x0, x1, faces = crumpled(0, 48)
-    detector, found = bsc.CollisionDetector(bsc.CollisionMesh(faces, len(x0), device=device)), []
-    for many in (2**30, 0):
+    mesh, found, left = bsc.CollisionMesh(faces, len(x0), device=device), [], []
+    for in_batches, many in ((True, 2**30), (False, 2**30), (False, 0)):
+        monkeypatch.setattr(contact, "decides_in_batches", lambda of, value=in_batches: value and of.is_cpu)
         monkeypatch.setattr("warp_bsc.detection.narrow.rules.contact._MANY", many)
-        found.append(detector.detect(x0, x1, toi=timed))
-        assert found[-1].certified and len(found[-1].edge_edge) > 1000
-    assert_same(*found)
+        pipeline = DetectionPipeline(mesh)
+        finder = CollisionFinder(pipeline, pipeline.broad_phase.lock)
+        found.append(finder.find(*(wp.array(x, dtype=wp.vec3, device=device) for x in (x0, x1))))
+        left.append(pipeline.counts.pairs[PairKind.EDGE_EDGE].subdivided)
+    assert_same(found[0], found[1])
+    assert_same(found[0], found[2])
+    assert left[:2] == [0, 0] and 0 < left[2] < 0.8 * len(found[0].edge_edge)
 
 
 def test_large_meshes_begin_with_room_for_fewer_contacts(monkeypatch):

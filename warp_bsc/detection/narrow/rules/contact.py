@@ -173,6 +173,11 @@ def _impact_kernel(dtype: type, simple: bool) -> wp.Kernel:
     return find_impacts
 
 
+def decides_in_batches(device: wp.Device) -> bool:
+    """Returns whether pairs are decided many at a time, by SIMD instructions; a test runs the kernels of a GPU on a CPU."""
+    return device.is_cpu
+
+
 def run_contacts(
     phases: Phases,
     x0: wp.array,
@@ -205,7 +210,7 @@ def run_contacts(
     options.roundoff = 0.0 if method == "float" else ROUNDOFF
     if arcs is not None:
         options.arcs = arcs
-    buffers, is_cpu = buffers_of(phases), x0.device.is_cpu
+    buffers, in_batches = buffers_of(phases), decides_in_batches(x0.device)
     motion = [x0, x1, options.roundoff]
 
     def launch_batches(kernel_of: Callable, others: list, buffer: str, count: Count, batch: int) -> None:
@@ -217,19 +222,19 @@ def run_contacts(
         launch_together(kernels, device=x0.device, chunk=16)
 
     with timer.phase("cull"):
-        if is_cpu:
+        if in_batches:
             cull = functools.partial(batch_culling_kernel, on_arcs=arcs is not None)
             others = [boxes_meet and x0.dtype is wp.vec3, Arcs() if arcs is None else arcs]
             launch_batches(cull, others, "queue", Count.QUEUED, CULLED)
         else:
             launch_culls(_RULE, buffers, x0, x1, options)
     with timer.phase("classify"):
-        if is_cpu:
+        if in_batches:
             launch_batches(batch_classification_kernel, [], "survivors", Count.SURVIVORS, CLASSIFIED)
         else:
             launch_decisions(_RULE, buffers, x0, x1, options)
     with timer.phase("time of impact"):
-        if is_cpu:
+        if in_batches:
             launch_batches(batch_impact_kernel, [timed, tolerance], "for_exact", Count.CONTACTS, DECIDED)
         else:
             are_many = max(len(phase.contacts.pairs) for phase, _elements in phases) > _MANY
