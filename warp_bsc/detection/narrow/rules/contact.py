@@ -174,7 +174,7 @@ def _impact_kernel(dtype: type, simple: bool) -> wp.Kernel:
 
 
 def decides_in_batches(device: wp.Device) -> bool:
-    """Returns whether pairs are decided many at a time, by SIMD instructions; a test runs the kernels of a GPU on a CPU."""
+    """Returns whether pairs are decided many at a time, by SIMD instructions; a test runs those of a GPU on a CPU."""
     return device.is_cpu
 
 
