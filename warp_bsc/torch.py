@@ -11,7 +11,7 @@ import warp as wp
 from newton.solvers import SolverBase
 
 from ._arguments import check_instance
-from .response.rollout import Rollout, RolloutOptions
+from ._rollout import Rollout, RolloutOptions
 
 try:
     import torch

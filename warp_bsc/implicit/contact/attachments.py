@@ -20,17 +20,11 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class ParticleAttachments:
-    """The attachments of a model, by particle.
+    """The attachments of a model, by particle."""
 
-    Attributes:
-        first: First entry of each particle, and the end of the last.
-        items: Attachments.
-        body: Body of each attachment, and so on as in ``newton.Model``.
-    """
-
-    first: wp.array[int]
-    items: wp.array[int]
-    body: wp.array[int]
+    first: wp.array[int]  # first entry of each particle, and the end of the last
+    items: wp.array[int]  # attachments
+    body: wp.array[int]  # body of each attachment, and so on as in ``newton.Model``
     body_point: wp.array[wp.vec3]
     stiffness: wp.array[float]
     damping: wp.array[float]

@@ -67,62 +67,36 @@ class Phase(IntEnum):
 
 @wp.struct
 class Flow:
-    """Where the Newton steps are.
+    """Where the Newton steps are."""
 
-    Attributes:
-        phase: The phase of each world that comes next.
-        solves: Solves of each world in its Newton step so far.
-        solves_next: 1 if a solve comes next for one, shape [1].
-        goes_on: 1 if a search for candidates or larger buffers come next for one, shape [1].
-        arrived: How often blocks of threads of each world have waited.
-        listed: Worlds whose solve comes next, in any order: of this launch, and of the next one, shape [2 worlds].
-        turn: Which of both lists this launch has, shape [1].
-        count: Length of both lists, shape [2].
-        taken: Worlds that blocks have taken after their first ones, shape [1].
-        ended: Blocks that have ended, shape [1].
-        any_leaves: 1 if a vertex leaves its box, shape [1].
-        lacks: See :func:`.results.write_results`, shape [2].
-    """
-
-    phase: wp.array[int]
-    solves: wp.array[int]
-    solves_next: wp.array[int]
-    goes_on: wp.array[int]
-    arrived: wp.array[int]
+    phase: wp.array[int]  # the phase of each world that comes next
+    solves: wp.array[int]  # solves of each world in its Newton step so far
+    solves_next: wp.array[int]  # 1 if a solve comes next for one, shape [1]
+    goes_on: wp.array[int]  # 1 if a search for candidates or larger buffers come next for one, shape [1]
+    arrived: wp.array[int]  # how often blocks of threads of each world have waited
+    # worlds whose solve comes next, in any order: of this launch, and of the next one, shape [2 worlds]
     listed: wp.array[int]
-    turn: wp.array[int]
-    count: wp.array[int]
-    taken: wp.array[int]
-    ended: wp.array[int]
-    any_leaves: wp.array[int]
-    lacks: wp.array[int]
+    turn: wp.array[int]  # which of both lists this launch has, shape [1]
+    count: wp.array[int]  # length of both lists, shape [2]
+    taken: wp.array[int]  # worlds that blocks have taken after their first ones, shape [1]
+    ended: wp.array[int]  # blocks that have ended, shape [1]
+    any_leaves: wp.array[int]  # 1 if a vertex leaves its box, shape [1]
+    lacks: wp.array[int]  # see :func:`.results.write_results`, shape [2]
 
 
 @wp.struct
 class Place:
-    """A thread in a phase of its world.
-
-    Attributes:
-        world: The world.
-        thread: Number of the thread.
-        threads: Threads of the world.
-        blocks: Their blocks.
-        spread: Number of the thread by which blocks take turns, warp by warp: each has its share of what is little.
-        phase: Phase of the world.
-        then: The one after those over pairs.
-        passes: Passes in which displacements were cut.
-        solves: Solves in the Newton step so far.
-    """
+    """A thread in a phase of its world."""
 
     world: int
-    thread: int
-    threads: int
-    blocks: int
-    spread: int
-    phase: int
-    then: int
-    passes: int
-    solves: int
+    thread: int  # number of the thread
+    threads: int  # threads of the world
+    blocks: int  # their blocks
+    spread: int  # number of the thread by which blocks take turns, warp by warp: each has its share of what is little
+    phase: int  # phase of the world
+    then: int  # the one after those over pairs
+    passes: int  # passes in which displacements were cut
+    solves: int  # solves in the Newton step so far
 
 
 @wp.struct

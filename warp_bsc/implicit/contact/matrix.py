@@ -16,22 +16,15 @@ class Matrix:
 
     Threads are in groups of so many as read together. The ``k``-th blocks of all threads of a group are side by side,
     component by component.
-
-    Attributes:
-        width: Threads of a group.
-        group: First group of each world.
-        first: First entry of each group, and the end of the last: as many as its threads have blocks at most.
-        column: Unknown of each entry of each thread, -1 where a thread has fewer.
-        value: Components of blocks [N/m].
-        place: Of each block of :class:`.rows.Rows`, where its first component is.
     """
 
-    width: int
-    group: wp.array[int]
+    width: int  # threads of a group
+    group: wp.array[int]  # first group of each world
+    # first entry of each group, and the end of the last: as many as its threads have blocks at most
     first: wp.array[int]
-    column: wp.array[int]
-    value: wp.array[float]
-    place: wp.array[int]
+    column: wp.array[int]  # unknown of each entry of each thread, -1 where a thread has fewer
+    value: wp.array[float]  # components of blocks [N/m]
+    place: wp.array[int]  # of each block of :class:`.rows.Rows`, where its first component is
 
 
 def make_matrix(rows: Rows, of_worlds: np.ndarray, parts: int, device: wp.Device) -> Matrix:

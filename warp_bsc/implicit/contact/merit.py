@@ -3,6 +3,7 @@
 import warp as wp
 
 from ...response.contacts.rules import inverse_mass_of
+from ...response.state.fixed_sum import add_units
 from ...response.state.planes import signed_distance
 from ...response.state.structs import Motion
 from ...response.state.vectors import HALF, ZERO, corners_of, to_double
@@ -33,40 +34,12 @@ _UNITS_LIMIT = wp.constant(wp.float64(2.0**52))
 """Most units of one energy: a thousand of them fit into a sum, and a speed of 900 m/s into one."""
 
 
-@wp.func_native(
-    snippet="""
-#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
-    // one atomic for all threads of a warp that are here, if of one world; in parts whose sums fit into 32 bits
-    const unsigned mask = __activemask();
-    int of_one_world;
-    __match_all_sync(mask, world, &of_one_world);
-    if (of_one_world) {
-        unsigned long long bits = (unsigned long long)units;
-        const unsigned low = __reduce_add_sync(mask, (unsigned)(bits & 0x3fffffu));
-        const unsigned middle = __reduce_add_sync(mask, (unsigned)((bits >> 22) & 0x1fffffu));
-        const unsigned high = __reduce_add_sync(mask, (unsigned)(bits >> 43));
-        bits = low + ((unsigned long long)middle << 22) + ((unsigned long long)high << 43);
-        if ((threadIdx.x & 31) == __ffs(mask) - 1)
-            atomicAdd((unsigned long long*)&energy.data[world], bits);
-        return;
-    }
-#endif
-#if defined(__CUDA_ARCH__)
-    atomicAdd((unsigned long long*)&energy.data[world], (unsigned long long)units);
-#else
-    energy.data[world] += units;
-#endif
-"""
-)
-def _add_units(energy: wp.array[wp.int64], world: int, units: wp.int64): ...
-
-
 @wp.func
 def add_energy(energy: wp.array[wp.int64], world: int, value: wp.float64, units: wp.array[wp.float64]):
     """Adds an energy [J] to that of a world, in units, so that the sum does not depend on the order of threads."""
     scaled = wp.clamp(units[world] * value, -_UNITS_LIMIT, _UNITS_LIMIT)
     scaled = wp.where(wp.isfinite(value), scaled, _UNITS_LIMIT)
-    _add_units(energy, world, wp.int64(wp.rint(scaled)))
+    add_units(energy, world, wp.int64(wp.rint(scaled)))
 
 
 @wp.func

@@ -91,29 +91,18 @@ class Candidates:
 
 @wp.struct
 class BarrierSettings:
-    """What barriers and friction depend on.
+    """What barriers and friction depend on."""
 
-    Attributes:
-        dt: Length of the step [s].
-        reach: Of each vertex: gap from which it pushes [m], infinite for shapes.
-        reach_of_bodies: Of each vertex of a body: gap from which it pushes other shapes [m]; infinite for others.
-        recovery: By how much more than its gap at the start a pair gets a gap by its barrier [m].
-        elasticity: Of each vertex: stiffness of the solid around it against a push [N/m].
-        is_of_face: 1 of each vertex of a face.
-        load: Of each vertex: about the force of its elements, and more [N].
-        smoothing: Length below which friction is smoothed [m].
-        units: Units of energy in a joule, in each world.
-    """
-
-    dt: wp.float64
-    reach: wp.array[float]
+    dt: wp.float64  # length of the step [s]
+    reach: wp.array[float]  # of each vertex: gap from which it pushes [m], infinite for shapes
+    # of each vertex of a body: gap from which it pushes other shapes [m]; infinite for others
     reach_of_bodies: wp.array[float]
-    recovery: wp.float64
-    elasticity: wp.array[float]
-    is_of_face: wp.array[int]
-    load: wp.array[float]
-    smoothing: wp.float64
-    units: wp.array[wp.float64]
+    recovery: wp.float64  # by how much more than its gap at the start a pair gets a gap by its barrier [m]
+    elasticity: wp.array[float]  # of each vertex: stiffness of the solid around it against a push [N/m]
+    is_of_face: wp.array[int]  # 1 of each vertex of a face
+    load: wp.array[float]  # of each vertex: about the force of its elements, and more [N]
+    smoothing: wp.float64  # length below which friction is smoothed [m]
+    units: wp.array[wp.float64]  # units of energy in a joule, in each world
 
 
 NO_FACE = wp.constant(2**31 - 1)

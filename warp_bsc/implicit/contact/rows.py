@@ -16,25 +16,16 @@ _OF_NONE = np.iinfo(np.int64).min
 
 @wp.struct
 class Rows:
-    """Rows of blocks, one for each unknown, and the corners and blocks of elements that they are the sums of.
+    """Rows of blocks, one for each unknown, and the corners and blocks of elements that they are the sums of."""
 
-    Attributes:
-        first: First block of each row, and the end of the last, shape [unknown_count + 1].
-        row: Row of each block.
-        column: Unknown of each block; the first of a row is that of the diagonal.
-        first_source: First block of elements in each block of a row, and the end of the last.
-        source: Blocks of elements; of bending, -1 less 16 times the element plus 4 times one corner plus the other.
-        first_corner: First corner of elements in each unknown, and the end of the last.
-        corner: Corners of elements.
-    """
-
-    first: wp.array[int]
-    row: wp.array[int]
-    column: wp.array[int]
-    first_source: wp.array[int]
+    first: wp.array[int]  # first block of each row, and the end of the last, shape [unknown_count + 1]
+    row: wp.array[int]  # row of each block
+    column: wp.array[int]  # unknown of each block; the first of a row is that of the diagonal
+    first_source: wp.array[int]  # first block of elements in each block of a row, and the end of the last
+    # blocks of elements; of bending, -1 less 16 times the element plus 4 times one corner plus the other
     source: wp.array[int]
-    first_corner: wp.array[int]
-    corner: wp.array[int]
+    first_corner: wp.array[int]  # first corner of elements in each unknown, and the end of the last
+    corner: wp.array[int]  # corners of elements
 
 
 def make_rows(vertices: list[np.ndarray], unknown: np.ndarray, count: int, device: wp.Device) -> Rows:

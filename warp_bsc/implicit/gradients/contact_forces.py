@@ -36,17 +36,11 @@ _SINGULAR = wp.constant(wp.float64(1e-14))
 
 @wp.struct
 class RecordedContacts:
-    """Contacts at the end of a step.
+    """Contacts at the end of a step."""
 
-    Attributes:
-        kind: Kind of each, -1 beyond their number.
-        plane: The plane of a contact at one.
-        fall: How far gravity moves what is at rest in the step, by world [m].
-    """
-
-    kind: wp.array[int]
-    plane: wp.array[int]
-    fall: wp.array[float]
+    kind: wp.array[int]  # kind of each, -1 beyond their number
+    plane: wp.array[int]  # the plane of a contact at one
+    fall: wp.array[float]  # how far gravity moves what is at rest in the step, by world [m]
 
 
 @wp.func

@@ -49,19 +49,12 @@ class Vector(IntEnum):
 
 @wp.struct
 class Team:
-    """The threads that solve for a world: one block, or several that wait for each other.
-
-    Attributes:
-        blocks: Number of blocks.
-        parts: Threads that share a row, a power of 2.
-        arrived: How often blocks have waited for the others, shape [worlds].
-        sums: Two of each block of each world, shape [worlds, 2 blocks].
-    """
+    """The threads that solve for a world: one block, or several that wait for each other."""
 
     blocks: int
-    parts: int
-    arrived: wp.array[int]
-    sums: wp.array2d[wp.vec2d]
+    parts: int  # threads that share a row, a power of 2
+    arrived: wp.array[int]  # how often blocks have waited for the others, shape [worlds]
+    sums: wp.array2d[wp.vec2d]  # two of each block of each world, shape [worlds, 2 blocks]
 
 
 @wp.func_native(

@@ -12,39 +12,25 @@ _ONE = wp.constant(wp.float64(1.0))
 
 @wp.struct
 class ContactRows:
-    """Jacobians of the forces of contacts, by unknown.
+    """Jacobians of the forces of contacts, by unknown."""
 
-    Attributes:
-        offsets: First entry of each unknown, and the end of the last, int32, shape [unknown_count + 1].
-        entries: Size times an element plus the place of the unknown in it, int32.
-        unknowns: Unknowns of elements, -1 for none, int32, shape [n, size].
-        jacobian: Minus blocks of the matrix, see :class:`.elements.Elements`.
-    """
-
-    offsets: wp.array[int]
-    entries: wp.array[int]
-    unknowns: wp.array2d[int]
-    jacobian: wp.array3d[wp.vec3d]
+    offsets: wp.array[int]  # first entry of each unknown, and the end of the last, int32, shape [unknown_count + 1]
+    entries: wp.array[int]  # size times an element plus the place of the unknown in it, int32
+    unknowns: wp.array2d[int]  # unknowns of elements, -1 for none, int32, shape [n, size]
+    jacobian: wp.array3d[wp.vec3d]  # minus blocks of the matrix, see :class:`.elements.Elements`
 
 
 @wp.struct
 class Matrix:
-    """The matrix A of a step, scaled: R^T A R, where R R^T are the inverted blocks of the diagonal.
+    """The matrix A of a step, scaled: R^T A R, where R R^T are the inverted blocks of the diagonal."""
 
-    Attributes:
-        offsets: First block of each row, and the end of the last, int32, shape [unknown_count + 1].
-        columns: Columns of blocks, int32, shape [n].
-        values: Blocks of inertia, elastic forces, and contacts whose unknowns are all of one element, shape [n].
-        contacts: Blocks of the other contacts.
-        roots: R by unknown.
-        eigenvalues: Eigenvalues of the blocks of the diagonal that R R^T inverts, one for each column of R.
-    """
-
-    offsets: wp.array[int]
-    columns: wp.array[int]
+    offsets: wp.array[int]  # first block of each row, and the end of the last, int32, shape [unknown_count + 1]
+    columns: wp.array[int]  # columns of blocks, int32, shape [n]
+    # blocks of inertia, elastic forces, and contacts whose unknowns are all of one element, shape [n]
     values: wp.array[wp.mat33d]
-    contacts: ContactRows
-    roots: wp.array[wp.mat33d]
+    contacts: ContactRows  # blocks of the other contacts
+    roots: wp.array[wp.mat33d]  # R by unknown
+    # eigenvalues of the blocks of the diagonal that R R^T inverts, one for each column of R
     eigenvalues: wp.array[wp.vec3d]
 
 

@@ -86,7 +86,8 @@ def detect(work: Workspace, *, only_changed: bool = False, keeps_constraints: bo
     queues = queues_of(detector)
     overflow = [detector.counters.array, detector.capacities]
     for pair in (queues[:2], queues[2:]) if queues[2:] else (queues[:2],):
-        work.launch_over_entries(collect_contacts, [*pair, *overflow, work.arcs, work.step, work.dividing, work.status])
+        inputs = [*pair, *overflow, work.arcs, work.step, work.dividing, work.status]
+        work.launch_over_entries(collect_contacts, inputs, is_large=True)
     _decide(work, overflow)
     wp.capture_if(work.loop[Loop.SEARCHING], _search, work=work, overflow=overflow)
 

@@ -190,7 +190,8 @@ def _collect(work, ends):
 
     def collect() -> None:
         queues = queues_of(detector, candidates=True)[:2]
-        work.launch_over_entries(collect_proximities, [work.step, *queues, work.nearest, work.status])
+        inputs = [work.step, *queues, work.nearest, work.status]
+        work.launch_over_entries(collect_proximities, inputs, is_large=True)
 
     retry_until_fits(lambda: detector.find_overlapping(x0, ends), detector, work.device)
     retry_until_fits(collect, work, work.device)

@@ -7,7 +7,7 @@ from typing import Any
 
 import warp as wp
 
-from ..state.fixed_sum import with_delta
+from ..state.fixed_sum import add_units, with_delta
 from ..state.poses import centre_of, in_world
 from ..state.structs import (
     DIVIDED,
@@ -43,7 +43,7 @@ def _add(sums: wp.array2d[wp.int64], world: int, added: Any):
     """Adds what a thread has summed to the sums of a world."""
     for i in range(len(added)):
         if added[i] != wp.int64(0):
-            wp.atomic_add(sums, world, i, added[i])
+            add_units(sums[world], i, added[i])
 
 
 @wp.func

@@ -18,7 +18,7 @@ from .bodies import activate_bodies, add_body_delta, body_inverse_masses
 
 
 @wp.func
-def _effective_inverse_masses(step: Step, i: int, x: wp.array[wp.vec3], counted: wp.float64):
+def effective_inverse_masses(step: Step, i: int, x: wp.array[wp.vec3], counted: wp.float64):
     """Returns the inverse masses of a constraint [1/kg] along its normal and across it, at positions ``x`` of vertices.
 
     Its vertices and bodies are split among the share ``counted`` of their active constraints.
@@ -37,7 +37,7 @@ def _effective_inverse_masses(step: Step, i: int, x: wp.array[wp.vec3], counted:
 
 
 @wp.func
-def _multiplier_after(
+def multiplier_after(
     multiplier: wp.vec3d,
     normal: wp.vec3d,
     excess: wp.float64,
@@ -79,41 +79,44 @@ def position_multiplier_after(step: Step, i: int, pushes_only: bool) -> wp.vec3d
     """Returns the position multiplier of a constraint after a sweep, without momentum."""
     old = step.constraints.position_multiplier[i]
     counted = wp.where(pushes_only, COUNTED, ONE)
-    along, across = _effective_inverse_masses(step, i, step.motion.x1, counted)
+    along, across = effective_inverse_masses(step, i, step.motion.x1, counted)
     if along <= ZERO:
         return old
     excess = gap(step, i)
     if pushes_only and excess >= ZERO:
         return old
     friction = wp.float64(step.constraints.friction[i])
-    return _multiplier_after(old, step.constraints.normal[i], excess, path_of(step, i), along, across, friction, ZERO)
+    return multiplier_after(old, step.constraints.normal[i], excess, path_of(step, i), along, across, friction, ZERO)
+
+
+@wp.func
+def speed_of_restitution(step: Step, i: int) -> wp.float64:
+    """Returns the speed at which contact points are to part [m/s]."""
+    if step.restitution[0] == 0.0:
+        return ZERO  # and what is predicted is not read
+    predicted = relative(step.constraints.weights[i], step.constraints.vertices[i], step.motion.velocity)
+    return wp.float64(step.restitution[0]) * wp.max(-wp.dot(step.constraints.normal[i], predicted), ZERO)
 
 
 @wp.func
 def excess_speed(step: Step, i: int) -> wp.float64:
     """Returns the speed at which contact points part less that of restitution [m/s]; negative if violated."""
-    normal = step.constraints.normal[i]
-    weights = step.constraints.weights[i]
-    corners = step.constraints.vertices[i]
-    speed = wp.dot(normal, relative(weights, corners, step.vertices.velocity))
-    if step.restitution[0] > 0.0:  # else what is predicted is not read
-        predicted = wp.dot(normal, relative(weights, corners, step.motion.velocity))
-        speed -= wp.float64(step.restitution[0]) * wp.max(-predicted, ZERO)
-    return speed
+    velocity = relative(step.constraints.weights[i], step.constraints.vertices[i], step.vertices.velocity)
+    return wp.dot(step.constraints.normal[i], velocity) - speed_of_restitution(step, i)
 
 
 @wp.func
 def velocity_multiplier_after(step: Step, i: int) -> wp.vec3d:
     """Returns the velocity multiplier of a constraint after a sweep, without momentum."""
     old = step.constraints.velocity_multiplier[i]
-    along, across = _effective_inverse_masses(step, i, step.vertices.x1, ONE)
+    along, across = effective_inverse_masses(step, i, step.vertices.x1, ONE)
     if along <= ZERO:
         return old
     velocity = relative(step.constraints.weights[i], step.constraints.vertices[i], step.vertices.velocity)
     friction = wp.float64(step.constraints.friction[i])
     excess = excess_speed(step, i)
     least = step.constraints.resisted[i]
-    return _multiplier_after(old, step.constraints.normal[i], excess, velocity, along, across, friction, least)
+    return multiplier_after(old, step.constraints.normal[i], excess, velocity, along, across, friction, least)
 
 
 @wp.func
@@ -191,6 +194,12 @@ def momentum_of(step: Step, sweep: int, i: int, most: int) -> wp.float64:
     """
     last = step.constraints.last_sweep[i]
     step.constraints.last_sweep[i] = sweep
+    return momentum_after(last, sweep, most)
+
+
+@wp.func
+def momentum_after(last: int, sweep: int, most: int) -> wp.float64:
+    """Returns what :func:`momentum_of` does, of a multiplier that was active ``last`` in that sweep."""
     if last != sweep - 1 or sweep == most - 1:
         return ZERO
     return wp.float64(float(sweep) / float(sweep + 3))
@@ -206,11 +215,11 @@ def add_delta(
     body_sums: wp.array2d[wp.int64],
 ):
     """Adds what the change of a multiplier does to the vertices and bodies of its constraint, at positions ``x``."""
+    corners, weights = wp.vec4i(step.constraints.vertices[i]), wp.vec4d(step.constraints.weights[i])  # read once
     for j in range(4):
-        vertex = step.constraints.vertices[i][j]
-        share = step.constraints.weights[i][j] * wp.float64(step.motion.inverse_mass[vertex])
+        share = weights[j] * wp.float64(step.motion.inverse_mass[corners[j]])
         if share != ZERO:
-            add_to_sum(sums, vertex, 0, share * change)
+            add_to_sum(sums, corners[j], 0, share * change)
     if step.motion.bodies.of_vertex:
         add_body_delta(step, i, change, x, body_sums)
 

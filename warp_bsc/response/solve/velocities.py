@@ -6,11 +6,11 @@ import warp as wp
 
 from ..._profiling import phase
 from ..contacts.constraints import NEVER_SWEPT, gap, has_pushed, min_distance_of, moves_body
-from ..state.cluster import BLOCK, wait_for_others
-from ..state.fixed_sum import with_delta
+from ..state.cluster import BLOCK, wait_for_block, wait_for_others
+from ..state.fixed_sum import add_to_sum, with_delta
 from ..state.status import Loop, SolveStatus
 from ..state.structs import Incidence, Step, constraint_at, constraint_count, has_final_velocity
-from ..state.vectors import ONE, ZERO, relative
+from ..state.vectors import ONE, ZERO, relative, to_double
 from ..state.workspace import Workspace
 from ..tuning import MAX_SWEEPS, SWEEPS_PER_BATCH, TOLERANCE_OF_BODIES
 from . import sweeps
@@ -27,6 +27,9 @@ from .angular_momentum import (
 from .bodies import activate_bodies, change_body_velocities, move_to_end, set_vertex_velocities
 
 wp.set_module_options({"enable_backward": False})
+
+_Velocities = wp.types.matrix(shape=(4, 3), dtype=wp.float32)
+"""Of the vertices of a constraint [m/s]."""
 
 
 @wp.func
@@ -129,6 +132,64 @@ def _update_world(step: Step, particles: Incidence, world: int, last: bool, thre
             _change_velocity(step, particles.items[k])
 
 
+@wp.func
+def _sweep_alone(step: Step, sweep: int, batch: int, place: int, end: int):
+    """Makes a batch of sweeps over at most as many constraints as a block has threads, none of which moves a body.
+
+    Results are those of any other sweeps. Each thread keeps its constraint and the velocities of its vertices: most of
+    the time of a sweep over few is that of one thread's instructions, of which this leaves a third.
+    """
+    motion, vertices, constraints = step.motion, step.vertices, step.constraints
+    is_here = place < end
+    i = int(constraints.active_set[wp.min(place, end - 1)])
+    corners, weights = wp.vec4i(constraints.vertices[i]), wp.vec4d(constraints.weights[i])  # copies, not references
+    normal = wp.vec3d(constraints.normal[i])
+    friction, least = wp.float64(constraints.friction[i]), wp.float64(constraints.resisted[i])
+    inverse_mass, _across = sweeps.effective_inverse_masses(step, i, vertices.x1, ONE)
+    restitution = sweeps.speed_of_restitution(step, i)
+    multiplier = wp.vec3d(constraints.velocity_multiplier[i])
+    previous = wp.vec3d(constraints.previous_multiplier[i])
+    last = int(constraints.last_sweep[i])
+    shares, moves, predicted, velocity = wp.vec4d(), wp.vec4i(), _Velocities(), _Velocities()
+    for j in range(4):
+        vertex = corners[j]
+        shares[j] = weights[j] * wp.float64(motion.inverse_mass[vertex])
+        moves[j] = wp.where(shares[j] == ZERO or has_final_velocity(vertices.outcome[vertex]), 0, 1)
+        predicted[j] = motion.velocity[vertex]
+        velocity[j] = vertices.velocity[vertex]
+    for now in range(sweep, sweep + batch):
+        if is_here:
+            relative_velocity = wp.vec3d()
+            for j in range(4):
+                relative_velocity += weights[j] * to_double(velocity[j])
+            after = wp.vec3d(multiplier)
+            if inverse_mass > ZERO:
+                excess = wp.dot(normal, relative_velocity) - restitution
+                after = sweeps.multiplier_after(
+                    multiplier, normal, excess, relative_velocity, inverse_mass, inverse_mass, friction, least
+                )
+            moved = after + sweeps.momentum_after(last, now, MAX_SWEEPS) * (after - previous)
+            for j in range(4):
+                if shares[j] != ZERO:
+                    add_to_sum(vertices.particle_delta_v, corners[j], 0, shares[j] * (moved - multiplier))
+            previous, multiplier, last = after, moved, now
+        wait_for_block()
+        if is_here:
+            for j in range(4):
+                if moves[j] != 0:
+                    velocity[j] = with_delta(predicted[j], vertices.particle_delta_v, corners[j])
+        wait_for_block()
+    if not is_here:
+        return
+    constraints.velocity_multiplier[i] = multiplier
+    constraints.previous_multiplier[i] = previous
+    constraints.last_sweep[i] = last
+    for j in range(4):
+        vertices.active[corners[j]] = 0
+        if moves[j] != 0:
+            vertices.velocity[corners[j]] = velocity[j]
+
+
 @functools.cache
 def _sweep(cluster: int) -> wp.Kernel:
     """Returns the kernel that solves velocities of each world by one cluster of blocks, see :mod:`.state.cluster`."""
@@ -165,6 +226,12 @@ def _sweep(cluster: int) -> wp.Kernel:
             active_end = first + int(constraints.active_count[world])
             if active_end == first:
                 break
+            if active_end - first <= wp.min(threads, BLOCK):
+                if thread < BLOCK:
+                    _sweep_alone(step, sweep, batch, first + thread, active_end)
+                wait_for_others()
+                sweep += batch
+                continue
             for i_of_batch in range(batch):
                 for place in range(first + thread, active_end, threads):
                     _project_constraint(step, sweep, place)

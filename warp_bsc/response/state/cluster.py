@@ -96,3 +96,9 @@ def list_constraints(step: Step, threads: int):
 def wait_for_others():
     """Waits for all threads of the world; each then sees what the others wrote. All of them have to call it."""
     ...
+
+
+@wp.func_native(snippet="\n#if defined(__CUDA_ARCH__)\n    __syncthreads();\n#endif\n")
+def wait_for_block():
+    """Waits as :func:`wait_for_others`, for those of the same block."""
+    ...

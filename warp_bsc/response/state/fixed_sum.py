@@ -46,3 +46,33 @@ def with_delta(x: wp.vec3, sums: wp.array2d[wp.int64], vertex: int) -> wp.vec3:
 def sums_of(sums: wp.array2d[wp.int64], body: int):
     """Returns the linear and the angular part of the sums of a body."""
     return sum_of(sums, body, 0), sum_of(sums, body, 3)
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
+    // one atomic for all threads of a warp that are here, if to one sum; in parts whose sums fit into 32 bits
+    const unsigned mask = __activemask();
+    int same;
+    __match_all_sync(mask, (unsigned long long)&sums.data[i], &same);
+    if (same) {
+        unsigned long long bits = (unsigned long long)units;
+        const unsigned low = __reduce_add_sync(mask, (unsigned)(bits & 0x3fffffu));
+        const unsigned middle = __reduce_add_sync(mask, (unsigned)((bits >> 22) & 0x1fffffu));
+        const unsigned high = __reduce_add_sync(mask, (unsigned)(bits >> 43));
+        bits = low + ((unsigned long long)middle << 22) + ((unsigned long long)high << 43);
+        if ((threadIdx.x & 31) == __ffs(mask) - 1)
+            atomicAdd((unsigned long long*)&sums.data[i], bits);
+        return;
+    }
+#endif
+#if defined(__CUDA_ARCH__)
+    atomicAdd((unsigned long long*)&sums.data[i], (unsigned long long)units);
+#else
+    sums.data[i] += units;
+#endif
+"""
+)
+def add_units(sums: wp.array[wp.int64], i: int, units: wp.int64):
+    """Adds units to a sum that all threads share."""
+    ...

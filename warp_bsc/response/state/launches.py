@@ -23,14 +23,16 @@ class Launches:
         """Launches a kernel on the device."""
         wp.launch(kernel, size, inputs=inputs, outputs=outputs, device=self.device)
 
-    def launch_over_entries(self, kernel: wp.Kernel, inputs: Sequence, on_cores: bool = False) -> None:
+    def launch_over_entries(self, kernel: wp.Kernel, inputs: Sequence, *, on_cores=False, is_large=False) -> None:
         """Launches a kernel that takes all entries of a queue, of which the device knows the number.
 
         Its last input is the number of its threads: each takes every so many-th entry, so that capacity that is not
         used costs nothing. On the CPU it is one thread, because Warp's additions are not atomic there, or eight for
-        each core for a kernel that runs ``on_cores``, see :func:`.launch_on_cores`.
+        each core for a kernel that runs ``on_cores``, see :func:`.launch_on_cores`. Of one that ``is_large``, fewer run
+        at once on a GPU, for their registers.
         """
         threads = 8 * cores_for(kernel, self.device) if on_cores and self.device.is_cpu else self._threads
+        threads = threads // 4 if is_large and self.device.is_cuda else threads
         launch_on_cores(kernel, threads, inputs=[*inputs, threads], device=self.device)
 
     def launch_over_constraints(self, kernel: wp.Kernel, *inputs) -> None:

@@ -225,7 +225,7 @@ class Workspace(Launches):
         self.max_penetrations = self.vertices_at_planes * int(planes_of_a_world)
         self.kept = wp.zeros(1, dtype=int, device=device)
         self.moments = wp.zeros((self.worlds, int(SUMS)), dtype=wp.int64, device=device)
-        self.summing_threads = 1 if device.is_cpu else 64 * device.sm_count  # few, as all add to the same sums
+        self.summing_threads = 1 if device.is_cpu else 256 * device.sm_count  # few, as their warps add to the same sums
         self._threads = 1 if device.is_cpu else THREADS * device.sm_count
 
     def write_arcs(self) -> None:

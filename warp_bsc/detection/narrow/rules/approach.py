@@ -39,21 +39,13 @@ _RINGS = 1
 
 @wp.struct
 class MinDistances:
-    """The minimum distances of a mesh; without arrays there are none.
+    """The minimum distances of a mesh; without arrays there are none."""
 
-    Attributes:
-        radius: Radius of each vertex, half of the minimum distance included [m].
-        of_planes: Radius of each infinite plane, half of the minimum distance included [m].
-        reach: Largest distance of proximities beyond their minimum distance [m].
-        rings: Vertices whose elements have no minimum distance.
-        rigid_id: Rigid body of each vertex, by any number; pairs within one are skipped. -1 for none.
-    """
-
-    radius: wp.array[wp.float64]
-    of_planes: wp.array[wp.float64]
-    reach: wp.float64
-    rings: Rings
-    rigid_id: wp.array[int]
+    radius: wp.array[wp.float64]  # of each vertex, half of the minimum distance included [m]
+    of_planes: wp.array[wp.float64]  # of each infinite plane, half of the minimum distance included [m]
+    reach: wp.float64  # largest distance of proximities beyond their minimum distance [m]
+    rings: Rings  # vertices whose elements have no minimum distance
+    rigid_id: wp.array[int]  # rigid body of each vertex, by any number; pairs within one are skipped; -1 for none
 
 
 def make_min_distances(
@@ -109,19 +101,12 @@ def impact_on_arcs_at_distance(
 
 @wp.struct
 class Options:
-    """Options of the rules.
-
-    Attributes:
-        distances: The minimum distances.
-        arcs: The arcs of bodies that turn.
-        proximities: Whether to report proximities.
-        tolerance: Of the times of impact, as a share of the step.
-    """
+    """Options of the rules."""
 
     distances: MinDistances
-    arcs: Arcs
-    proximities: bool
-    tolerance: wp.float64
+    arcs: Arcs  # of bodies that turn
+    proximities: bool  # whether to report proximities
+    tolerance: wp.float64  # of the times of impact, as a share of the step
 
 
 @made_once

@@ -64,11 +64,7 @@ def bound_arc(arcs: Arcs, vertex: int, x0: wp.vec3d, x1: wp.vec3d):
 
 @wp.struct
 class Options:
-    """Options of the rule.
-
-    Attributes:
-        arcs: The arcs.
-    """
+    """Options of the rule."""
 
     arcs: Arcs
 

@@ -38,15 +38,10 @@ from ..pair_kernels import (
 
 @wp.struct
 class Options:
-    """Options of the rule.
+    """Options of the rule."""
 
-    Attributes:
-        roundoff: Roundoff of floating point, 0 if its computed signs decide.
-        arcs: Pairs with a turning vertex are left out, for :mod:`.arc`.
-    """
-
-    roundoff: wp.float64
-    arcs: Arcs
+    roundoff: wp.float64  # roundoff of floating point, 0 if its computed signs decide
+    arcs: Arcs  # pairs with a turning vertex are left out, for :mod:`.arc`
 
 
 @wp.func

@@ -31,23 +31,15 @@ thread searches for one pair."""
 
 @wp.struct
 class Options:
-    """Options of the rule.
+    """Options of the rule."""
 
-    Attributes:
-        radius: Radius of each vertex.
-        rings: Vertices whose elements are excluded.
-        body: Body of each vertex: pairs whose vertices are all of one body from -1 are excluded. Without it none are.
-        roundoff: Roundoff of floating point, 0 if its computed signs decide.
-        timed: Whether to find times of impact within the tolerance.
-        tolerance: Tolerance of the times of impact, as a share of the step.
-    """
-
-    radius: wp.array[wp.float64]
-    rings: Rings
+    radius: wp.array[wp.float64]  # of each vertex
+    rings: Rings  # vertices whose elements are excluded
+    # body of each vertex: pairs whose vertices are all of one body from -1 are excluded. Without it none are.
     body: wp.array[int]
-    roundoff: wp.float64
-    timed: bool
-    tolerance: wp.float64
+    roundoff: wp.float64  # roundoff of floating point, 0 if its computed signs decide
+    timed: bool  # whether to find times of impact within the tolerance
+    tolerance: wp.float64  # of the times of impact, as a share of the step
 
 
 @wp.func

@@ -9,8 +9,8 @@ import newton
 import warp as wp
 from newton.solvers import SolverBase
 
-from .._arguments import check_instance, checked_choice, checked_integer, checked_number
-from .._private_names.of_warp import paused_tape
+from ._arguments import check_instance, checked_choice, checked_integer, checked_number
+from ._private_names.of_warp import paused_tape
 
 STATE = {"particle_q": wp.vec3, "particle_qd": wp.vec3, "body_q": wp.transform, "body_qd": wp.spatial_vector}
 """Arrays of a state, with the types of their elements."""
