@@ -59,8 +59,9 @@ PACKAGES = {
     "checker": {"_arguments"},
     "detection": {"kernels", "checker", "_arguments", "_one_thread", "_private_names", "_sorted_keys"},
     "response": {"detection", "kernels", "_arguments", "_one_thread", "_private_names", "_profiling", "_warnings"},
-    "torch": {"response", "_arguments"},
-    "jax": {"response", "_arguments"},
+    "_rollout": {"_arguments", "_private_names"},
+    "torch": {"_rollout", "_arguments"},
+    "jax": {"_rollout", "_arguments"},
     "implicit": {
         "detection",
         "kernels",
@@ -136,7 +137,8 @@ LIBRARIES = {
         "warp_bsc/bench/peers/mujoco_flex.py",  # reads its models
         "warp_bsc/bench/peers/states.py",
         "warp_bsc/bench/measure/judge.py",
-        "torch",  # takes its solvers
+        "_rollout",  # takes its solvers
+        "torch",
         "jax",
     },
     "pxr": {
@@ -170,6 +172,7 @@ LIBRARIES = {
         "cli",
         "_private_names",
         "_profiling",
+        "_rollout",
         "torch",
         "jax",
     },
