@@ -224,8 +224,15 @@ def test_coded_boxes_are_apart_only_if_boxes_are(kind, device):
         assert found[inside][gap[inside] > step].all()
 
 
-@pytest.mark.parametrize("few_nodes", [face_hierarchy.FEW_NODES, 0])
-@pytest.mark.parametrize("worlds", [1, 3])
+@pytest.mark.parametrize(
+    "worlds, few_nodes",
+    [
+        (1, 0),
+        (3, face_hierarchy.FEW_NODES),
+        pytest.param(1, face_hierarchy.FEW_NODES, marks=pytest.mark.slow),
+        pytest.param(3, 0, marks=pytest.mark.slow),
+    ],
+)
 def test_many_bundles(worlds, few_nodes, monkeypatch):
     """More bundles than a warp tests at once, of one sheet that moves through itself; with groups of them as well."""
     monkeypatch.setattr(face_hierarchy, "FEW_NODES", few_nodes)
