@@ -84,25 +84,18 @@ def contour_gradients(
 
 @wp.struct
 class Planes:
-    """Planes that keep the elements of contacts apart, by vertex.
+    """Planes that keep the elements of contacts apart, by vertex."""
 
-    Attributes:
-        starts: Where the places of each row of vertices begin, and their number at last, array of int; None if there
-            are no planes.
-        places: Contacts of the vertices, each as 4 times its number plus that of the corner, array of int.
-        vertices: Corners of each contact, those of the second element last, array of vec4i.
-        weights: Coordinates of the contact in the elements, those of the second one negative, array of vec4d.
-        normals: Normals, array of vec3d.
-        gaps: Distances along the normal, array of float64.
-        mobilities: Reciprocal sums of the squared weights of corners that may move, array of float64.
-    """
-
+    # where the places of each row of vertices begin, and their number at last, array of int; None if there are no
+    # planes
     starts: wp.array[int]
-    places: wp.array[int]
-    vertices: wp.array[wp.vec4i]
+    places: wp.array[int]  # contacts of the vertices, each as 4 times its number plus that of the corner, array of int
+    vertices: wp.array[wp.vec4i]  # corners of each contact, those of the second element last, array of vec4i
+    # coordinates of the contact in the elements, those of the second one negative, array of vec4d
     weights: wp.array[wp.vec4d]
-    normals: wp.array[wp.vec3d]
-    gaps: wp.array[wp.float64]
+    normals: wp.array[wp.vec3d]  # normals, array of vec3d
+    gaps: wp.array[wp.float64]  # distances along the normal, array of float64
+    # reciprocal sums of the squared weights of corners that may move, array of float64
     mobilities: wp.array[wp.float64]
 
 

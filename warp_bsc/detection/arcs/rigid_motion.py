@@ -217,24 +217,17 @@ def points_on_arcs(
 
 @wp.struct
 class _Extent:
-    """How far a motion reaches, and how far vertices are from where arcs take their bodies.
+    """How far a motion reaches, and how far vertices are from where arcs take their bodies."""
 
-    Attributes:
-        bounds: As of :func:`warp_bsc.kernels.arcs.arc_bounds` for each vertex that has elements, 0 for others.
-        largest: Of all vertices: coordinate at the start, at the end, rounding, distance from the axis; and whether a
-            position is not finite, five numbers.
-        reference: The first vertex of each body.
-        distance: Largest distance of a vertex of each body from its centre at the start.
-        size: Largest coordinate of each body.
-        misfit: Largest distance of a vertex of each body from where arcs take it with the reference.
-    """
-
+    # as of kernels.arcs.arc_bounds for each vertex that has elements, 0 for others
     bounds: wp.array[wp.vec3d]
+    # of all vertices: coordinate at the start, at the end, rounding, distance from the axis; and whether a position is
+    # not finite, five numbers
     largest: wp.array[wp.float64]
-    reference: wp.array[int]
-    distance: wp.array[wp.float64]
-    size: wp.array[wp.float64]
-    misfit: wp.array[wp.float64]
+    reference: wp.array[int]  # the first vertex of each body
+    distance: wp.array[wp.float64]  # largest distance of a vertex of each body from its centre at the start
+    size: wp.array[wp.float64]  # largest coordinate of each body
+    misfit: wp.array[wp.float64]  # largest distance of a vertex of each body from where arcs take it with the reference
 
 
 @wp.func

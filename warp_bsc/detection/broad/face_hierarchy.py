@@ -76,7 +76,7 @@ class FaceHierarchy:
     face_count: int  # number of faces; greater cells are edges
     point_start: int  # first cell that is a point
     order: wp.array[int]  # cell at each place, -1 for none
-    # vertices of the cell at each place, and what it represents, see :mod:`warp_bsc.kernels.pipeline.corners`
+    # vertices of the cell at each place, and what it represents, see kernels.pipeline.corners
     faces: wp.array2d[int]
     face_edges: wp.array2d[int]  # edges of the face at each place
     edges: wp.array2d[int]  # vertices of each edge

@@ -32,21 +32,14 @@ for each other and must run together."""
 
 @wp.struct
 class Team:
-    """The threads that solve for a world: one block, or several that wait for each other.
+    """The threads that solve for a world: one block, or several that wait for each other."""
 
-    Attributes:
-        blocks: Number of blocks.
-        parts: Threads that share a row, a power of 2.
-        arrived: How often blocks have waited for the others, shape [worlds]; on a CPU the first counts threads.
-        sums: Two of each block of each world, shape [worlds, 2 blocks].
-        limit: Square of the residual at which the first solve of a Newton step ends, shape [worlds].
-    """
-
-    blocks: int
-    parts: int
+    blocks: int  # number of blocks
+    parts: int  # threads that share a row, a power of 2
+    # how often blocks have waited for the others, shape [worlds]; on a CPU the first counts threads
     arrived: wp.array[int]
-    sums: wp.array2d[float]
-    limit: wp.array[float]
+    sums: wp.array2d[float]  # two of each block of each world, shape [worlds, 2 blocks]
+    limit: wp.array[float]  # square of the residual at which the first solve of a Newton step ends, shape [worlds]
 
 
 def make_team(unknowns: int, worlds: int, device: wp.Device) -> tuple[Team, int, wp.Kernel]:

@@ -81,7 +81,7 @@ class Flow:
     taken: wp.array[int]  # worlds that blocks have taken after their first ones, shape [1]
     ended: wp.array[int]  # blocks that have ended, shape [1]
     any_leaves: wp.array[int]  # 1 if a vertex leaves its box, shape [1]
-    lacks: wp.array[int]  # see :func:`.results.write_results`, shape [2]
+    lacks: wp.array[int]  # see results.write_results, shape [2]
 
 
 @wp.struct

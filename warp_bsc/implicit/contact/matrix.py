@@ -24,7 +24,7 @@ class Matrix:
     first: wp.array[int]
     column: wp.array[int]  # unknown of each entry of each thread, -1 where a thread has fewer
     value: wp.array[float]  # components of blocks [N/m]
-    place: wp.array[int]  # of each block of :class:`.rows.Rows`, where its first component is
+    place: wp.array[int]  # of each block of rows.Rows, where its first component is
 
 
 def make_matrix(rows: Rows, of_worlds: np.ndarray, parts: int, device: wp.Device) -> Matrix:

@@ -42,50 +42,34 @@ class Candidates:
     Those of a world follow each other. What would come within its reach if vertices went a little farther than in the
     step before comes first there, the others from the end backwards, each in any order: threads that run together then
     mostly do the same, and where vertices do not go that far, only the first ones are looked at.
-
-    Attributes:
-        start: First of each world.
-        room: Room for those of each world.
-        near: Number of the first ones of each world.
-        far: Number of the others.
-        used: Room that worlds have taken, shape [1].
-        listed_edges: Number of pairs of edges of each world that the last displacements may bring within their reach,
-            or that are; -1 if they are not known.
-        listed_others: Number of the other ones, or 0.
-        list: Those of each world, each twice, and 1 more of those that displacements may not bring together yet, see
-            :func:`.bounds.list_pair`: edges from the start, the others from the end backwards.
-        corners: Vertices.
-        key: Number of the pair, see :func:`.system.key_of_pair`.
-        apart: How far the vertices of a pair can go together before it is within its reach, negative if it is [m].
-        kept: Distance that each pair keeps in any case [m]; without elements where all is 0.
-        level: Distance at which its barrier is infinite [m], no more than that.
-        reach: Gap beyond the level from which its barrier pushes [m].
-        stiffness: Of its barrier, by what that pushes apart; negative of edges of faces [N/m].
-        floor: Gap below which it hardly comes nearer in the step [m], see :func:`.barrier.floor_gap`.
-        share: Share of the last displacements before it would meet, :data:`FAR` or :data:`FAR_TOGETHER`.
-        now: Distance where the Newton step begins, or less, of what was not :data:`FAR` in the one before [m].
-        normal: Direction from the second closest point to the first where they were found last, 0 before, see
-            :func:`.distance_bounds.direction_of_bits`.
     """
 
-    start: wp.array[int]
-    room: wp.array[int]
-    near: wp.array[int]
-    far: wp.array[int]
-    used: wp.array[int]
+    start: wp.array[int]  # first of each world
+    room: wp.array[int]  # room for those of each world
+    near: wp.array[int]  # number of the first ones of each world
+    far: wp.array[int]  # number of the others
+    used: wp.array[int]  # room that worlds have taken, shape [1]
+    # number of pairs of edges of each world that the last displacements may bring within their reach, or that are; -1
+    # if they are not known
     listed_edges: wp.array[int]
-    listed_others: wp.array[int]
+    listed_others: wp.array[int]  # number of the other ones, or 0
+    # those of each world, each twice, and 1 more of those that displacements may not bring together yet, see
+    # bounds.list_pair: edges from the start, the others from the end backwards
     list: wp.array[int]
-    corners: wp.array[wp.vec4i]
-    key: wp.array[wp.int64]
+    corners: wp.array[wp.vec4i]  # vertices
+    key: wp.array[wp.int64]  # number of the pair, see system.key_of_pair
+    # how far the vertices of a pair can go together before it is within its reach, negative if it is [m]
     apart: wp.array[float]
-    kept: wp.array[wp.float64]
-    level: wp.array[wp.float64]
-    reach: wp.array[float]
-    stiffness: wp.array[wp.float64]
-    floor: wp.array[float]
-    share: wp.array[float]
+    kept: wp.array[wp.float64]  # distance that each pair keeps in any case [m]; without elements where all is 0
+    level: wp.array[wp.float64]  # distance at which its barrier is infinite [m], no more than that
+    reach: wp.array[float]  # gap beyond the level from which its barrier pushes [m]
+    stiffness: wp.array[wp.float64]  # of its barrier, by what that pushes apart; negative of edges of faces [N/m]
+    floor: wp.array[float]  # gap below which it hardly comes nearer in the step [m], see barrier.floor_gap
+    share: wp.array[float]  # share of the last displacements before it would meet, FAR or FAR_TOGETHER
+    # distance where the Newton step begins, or less, of what was not FAR in the one before [m]
     now: wp.array[float]
+    # direction from the second closest point to the first where they were found last, 0 before, see
+    # distance_bounds.direction_of_bits
     normal: wp.array[int]
 
 

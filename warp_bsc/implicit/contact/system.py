@@ -15,27 +15,19 @@ NOT_UNKNOWN = wp.constant(-1)
 
 @wp.struct
 class Unknowns:
-    """The unknowns of a step: displacements of particles, and of a body its shift and its turn, one after the other.
+    """The unknowns of a step: displacements of particles, and of a body its shift and its turn, one after the other."""
 
-    Attributes:
-        of_vertex: Unknown of each vertex of the mesh; :data:`NOT_UNKNOWN`, or -2 less the first unknown of its body.
-        particle: Particle of each unknown, -1 of those of bodies.
-        body: Body of each unknown, -1 of those of particles.
-        of_worlds: First unknown of each world, and the end of the last. Those of bodies come last in a world.
-        first_of_bodies: First unknown of a body in each world, or where its unknowns end.
-        is_free: 1 for each unknown that is solved for; the others are given.
-        inertia: Mass over the square of the length of the step, and attachments, of each particle [N/m].
-        arm: Of each vertex of a body that is solved for, from its centre of mass [m].
-    """
-
+    # unknown of each vertex of the mesh; NOT_UNKNOWN, or -2 less the first unknown of its body
     of_vertex: wp.array[int]
-    particle: wp.array[int]
-    body: wp.array[int]
+    particle: wp.array[int]  # particle of each unknown, -1 of those of bodies
+    body: wp.array[int]  # body of each unknown, -1 of those of particles
+    # first unknown of each world, and the end of the last. Those of bodies come last in a world.
     of_worlds: wp.array[int]
-    first_of_bodies: wp.array[int]
-    is_free: wp.array[int]
+    first_of_bodies: wp.array[int]  # first unknown of a body in each world, or where its unknowns end
+    is_free: wp.array[int]  # 1 for each unknown that is solved for; the others are given
+    # mass over the square of the length of the step, and attachments, of each particle [N/m]
     inertia: wp.array[wp.float64]
-    arm: wp.array[wp.vec3]
+    arm: wp.array[wp.vec3]  # of each vertex of a body that is solved for, from its centre of mass [m]
 
 
 @wp.struct

@@ -17,7 +17,7 @@ class ContactRows:
     offsets: wp.array[int]  # first entry of each unknown, and the end of the last, int32, shape [unknown_count + 1]
     entries: wp.array[int]  # size times an element plus the place of the unknown in it, int32
     unknowns: wp.array2d[int]  # unknowns of elements, -1 for none, int32, shape [n, size]
-    jacobian: wp.array3d[wp.vec3d]  # minus blocks of the matrix, see :class:`.elements.Elements`
+    jacobian: wp.array3d[wp.vec3d]  # minus blocks of the matrix, see elements.Elements
 
 
 @wp.struct

@@ -23,7 +23,9 @@ class Launches:
         """Launches a kernel on the device."""
         wp.launch(kernel, size, inputs=inputs, outputs=outputs, device=self.device)
 
-    def launch_over_entries(self, kernel: wp.Kernel, inputs: Sequence, *, on_cores=False, is_large=False) -> None:
+    def launch_over_entries(
+        self, kernel: wp.Kernel, inputs: Sequence, *, on_cores: bool = False, is_large: bool = False
+    ) -> None:
         """Launches a kernel that takes all entries of a queue, of which the device knows the number.
 
         Its last input is the number of its threads: each takes every so many-th entry, so that capacity that is not
