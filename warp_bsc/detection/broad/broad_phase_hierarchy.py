@@ -22,6 +22,9 @@ CLUSTERS_OF_PART = 2**15
 _TRAVERSAL_BLOCK = 128
 """Threads of a block of a traversal."""
 
+_LaunchOverFaces = tuple[Callable[[bool, bool], wp.Kernel], Sequence[Any]]
+"""A function that makes a kernel, and its inputs, see :meth:`BroadPhaseHierarchy.pair_faces`."""
+
 
 @wp.kernel(**NO_GRADIENTS)
 def _keep_largest(
@@ -130,9 +133,10 @@ class BroadPhaseHierarchy:
                 for those of rigid bodies, within which none are. What is not sought may be found as well.
             keep_separated: Whether to enqueue the pairs that an axis separates, too.
         """
-        launches = [(pair_elements_kernel, out[:4])]
-        if self._has_points and out[4:]:
-            launches.append((pair_points_kernel, out[4:]))
+        queues = [_queue_of(*queue) for queue in zip(out[::2], out[1::2], strict=True)]
+        launches: list[_LaunchOverFaces] = [(pair_elements_kernel, queues[:2])]
+        if self._has_points and queues[2:]:
+            launches.append((pair_points_kernel, queues[2:]))
         self.pair_faces(x0, x1, changed, keep_separated, *launches)
 
     def pair_edges_with_faces(self, x: wp.array, counts: wp.array, pairs: wp.array, *, is_end: bool = False) -> None:
@@ -145,7 +149,7 @@ class BroadPhaseHierarchy:
             is_end: Whether the positions are those at the end of the motion in the last :meth:`pair_elements`, whose
                 boxes are reused on a CPU.
         """
-        self.pair_faces(x, x, None, False, (pair_edges_with_faces_kernel, (counts, pairs)))
+        self.pair_faces(x, x, None, False, (pair_edges_with_faces_kernel, [_queue_of(counts, pairs)]))
 
     def fit(self, x0: wp.array, x1: wp.array, changed: wp.array | None = None, *, keep_separated: bool = False) -> None:
         """Writes the corners and the boxes of all faces, and boxes all nodes; arguments as of :meth:`pair_elements`."""
@@ -179,12 +183,13 @@ class BroadPhaseHierarchy:
         x1: wp.array,
         changed: wp.array | None = None,
         keep_separated: bool = False,
-        *launches: tuple[Callable[[bool, bool], wp.Kernel], Sequence[wp.array]],
+        *launches: _LaunchOverFaces,
     ) -> None:
         """Enqueues the pairs of faces that no axis separates and few others, or all whose swept boxes overlap.
 
         Those of each part of a large mesh take the place of those of the part before, once kernels have gone over them:
-        functions that make a kernel for boxes with a padding or without, swept or not, and its counts and queues.
+        functions that make a kernel for boxes with a padding or without, swept or not, and its inputs, which follow the
+        hierarchy and the queue; its last one is its threads.
         """
         self.fit(x0, x1, changed, keep_separated=keep_separated)
         parts = len(self._part_counts)
@@ -197,10 +202,9 @@ class BroadPhaseHierarchy:
             ends = [self._clusters * i // parts for i in (part, part + 1)]
             pairs = _queue_of(count, self.face_pairs)
             self.traverse(traversal_kernel(_enqueue_faces, Pairs, self.is_padded), pairs, *ends)
-            for make_kernel, out in launches:
-                queues = [_queue_of(*queue) for queue in zip(out[::2], out[1::2], strict=True)]
+            for make_kernel, inputs in launches:
                 kernel = make_kernel(self.is_padded, keep_separated)
-                launch(kernel, threads, inputs=[self.hierarchy, pairs, *queues, threads], **options)
+                launch(kernel, threads, inputs=[self.hierarchy, pairs, *inputs, threads], **options)
         if parts > 1:
             launch(_keep_largest, 1, inputs=[self._part_counts], outputs=[self._count], **options)
 

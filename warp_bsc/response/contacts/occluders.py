@@ -1,13 +1,14 @@
 """The nearest face of each vertex in each of six directions, and paths that end there: what is farther is behind it."""
 
-import functools
-
 import warp as wp
 
-from ...detection.broad.element_pairs import filtered_pairs, pair_functions
-from ...detection.broad.face_hierarchy import FaceHierarchy, traversal_kernel
+from ...detection.broad.element_pairs import Pairs, filtered_pairs, pair_functions
+from ...detection.broad.face_hierarchy import FaceHierarchy
+from ...detection.run.launch import made_once
+from ...detection.run.settings import NO_GRADIENTS, Counter
 from ...kernels.closest import weights_across
 from ...kernels.pipeline.hierarchy import lowest_set_bit
+from ...kernels.pipeline.queues import filled_entries
 from ...kernels.polynomials import VERTEX_FACE
 from ..state.status import SolveStatus
 from ..state.structs import Step
@@ -17,15 +18,6 @@ from .face_pairs import pair_of_bit
 from .queue import PairQueue, pair_count, vertices_of
 
 wp.set_module_options({"enable_backward": False})
-
-
-@wp.struct
-class NearestArguments:
-    """Input of a thread that looks at the vertices and faces of two faces."""
-
-    faces: FaceHierarchy
-    step: Step
-    nearest: wp.array2d[float]
 
 
 @wp.func
@@ -66,35 +58,51 @@ def find_nearest_in_queue(step: Step, vertex_face: PairQueue, nearest: wp.array2
         _keep_nearest(step, vertices_of(vertex_face, i), nearest)
 
 
-@functools.cache
-def find_nearest_in_hierarchy(padded: bool) -> wp.Kernel:
-    """The kernel that keeps the nearest face among those whose swept boxes overlap the vertex's; a GPU needs it."""
-    vertex_face_pairs = pair_functions(padded, True).vertex_face_pairs
+@made_once
+def nearest_among_faces_kernel(padded: bool, swept: bool) -> wp.Kernel:
+    """Returns the kernel that keeps the nearest face of each vertex among pairs of faces, as a GPU has in a queue."""
+    vertex_face_pairs = pair_functions(padded, swept).vertex_face_pairs
 
-    @wp.func
-    def visit(place: int, first: int, found: wp.uint32, arguments: NearestArguments):
-        mesh = arguments.faces
-        while found != wp.uint32(0):
-            other = first + lowest_set_bit(found)
-            found = found & (found - wp.uint32(1))
+    @wp.kernel(**NO_GRADIENTS)
+    def find_nearest_among_faces(
+        mesh: FaceHierarchy, face_pairs: Pairs, step: Step, nearest: wp.array2d[float], threads: int
+    ):
+        for i in range(wp.tid(), filled_entries(face_pairs.pairs, face_pairs.counts, 0), threads):
+            place = face_pairs.pairs[i][0]
+            other = face_pairs.pairs[i][1]
             left = vertex_face_pairs(mesh, place, other)
             left = left & ~filtered_pairs(mesh, place, other, left)
             while left != 0:
                 bit = lowest_set_bit(wp.uint32(left))
                 left = left & (left - 1)
                 _kind, _pair, corners = pair_of_bit(mesh, place, other, bit)
-                _keep_nearest(arguments.step, corners, arguments.nearest)
+                _keep_nearest(step, corners, nearest)
 
-    return traversal_kernel(visit, NearestArguments, padded)
+    return find_nearest_among_faces
 
 
 @wp.kernel
-def clip_paths(step: Step, nearest: wp.array2d[float], status: SolveStatus, ends: wp.array[wp.vec3]):
+def clip_paths(
+    # in
+    step: Step,
+    face_pairs: wp.array[wp.int64],
+    capacities: wp.array[wp.int64],
+    # in and out
+    nearest: wp.array2d[float],
+    # in
+    status: SolveStatus,
+    # out
+    ends: wp.array[wp.vec3],
+):
     """Clips paths where, by :func:`is_behind`, all that is farther is behind the nearest face.
 
-    Where elements cross, nothing is known to be behind another.
+    Where elements cross, nothing is known to be behind another; nor where the queue of pairs of faces was too small:
+    the nearest face of a vertex may be among those that did not fit, and which did depends on the order of threads.
     """
     vertex = wp.tid()
+    if face_pairs[0] > capacities[int(Counter.FACE_PAIRS)]:
+        for direction in range(6):
+            nearest[vertex, direction] = wp.inf
     x0 = step.motion.x0[vertex]
     end = step.vertices.x1[vertex]
     if status.crossings[step.motion.world[vertex]] == 0 and wp.isfinite(end):

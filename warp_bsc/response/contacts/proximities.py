@@ -16,7 +16,7 @@ from ..state.workspace import Workspace
 from ..tuning import REACH, RESTING_PATH
 from . import constraints
 from .closest_points import closest_vector
-from .occluders import NearestArguments, clip_paths, find_nearest_in_hierarchy, find_nearest_in_queue, is_behind
+from .occluders import clip_paths, find_nearest_in_queue, is_behind, nearest_among_faces_kernel
 from .queue import PairQueue, has_pair, pair_count, queues_of, vertices_of
 from .rules import ContactClass, are_occluded, are_on_body, are_parallel, crossed_at_start, owner_of
 
@@ -158,30 +158,30 @@ def add_proximities(work: Workspace) -> None:
     wp.copy(work.kept, work.constraints.count)
     nearest.fill_(np.inf)
     _find_nearest(work)
+    counters, capacities = work.detector.counters, work.detector.capacities
+    work.launch(clip_paths, len(ends), [work.step, counters.face_pairs, capacities, nearest, work.status, ends])
     work.launch_over_constraints(disable_contacts_behind, nearest, work.status)
-    work.launch(clip_paths, len(ends), [work.step, nearest, work.status, ends])
     _collect(work, ends)
-    inputs = [work.step, work.kept, work.max_contacts, work.detector.counters.array, work.detector.capacities]
+    inputs = [work.step, work.kept, work.max_contacts, counters.array, work.detector.capacities]
     work.launch(drop_proximities, 1, inputs)
 
 
 def _find_nearest(work):
     """Finds the nearest faces on the ways of all vertices in the last detection."""
     detector, broad_phase = work.detector, work.detector.broad_phase
-    if isinstance(broad_phase, BroadPhaseHierarchy):  # without a queue, as sheets behind others are many
-        arguments = NearestArguments()
-        arguments.faces, arguments.step, arguments.nearest = broad_phase.hierarchy, work.step, work.nearest
-        broad_phase.fit(work.step.motion.x0, work.vertices.x1, work.active, keep_separated=True)
-        broad_phase.traverse(find_nearest_in_hierarchy(broad_phase.is_padded), arguments)
-        return
 
     def find() -> None:
         detector.counters.array.zero_()
-        broad_phase.pair_vertices_with_faces(detector.vertex_face.counts, detector.vertex_face.queue)
+        if isinstance(broad_phase, BroadPhaseHierarchy):  # pairs of elements need no queue
+            among_faces = nearest_among_faces_kernel, [work.step, work.nearest]
+            broad_phase.pair_faces(work.step.motion.x0, work.vertices.x1, work.active, True, among_faces)
+        else:
+            broad_phase.pair_vertices_with_faces(detector.vertex_face.counts, detector.vertex_face.queue)
 
     retry_until_fits(find, detector, work.device)
-    queue = queues_of(detector, candidates=True)[0]
-    work.launch_over_entries(find_nearest_in_queue, [work.step, queue, work.nearest])
+    if not isinstance(broad_phase, BroadPhaseHierarchy):
+        queue = queues_of(detector, candidates=True)[0]
+        work.launch_over_entries(find_nearest_in_queue, [work.step, queue, work.nearest])
 
 
 def _collect(work, ends):

@@ -11,11 +11,11 @@ apart, follow each other in a few passes. Elements that slide along a plane go o
 
 import warp as wp
 
-from ..contacts.planes_between import FAR
+from ..contacts.planes_between import FAR, add_to_lists, begin_list
 from ..contacts.rules import inverse_mass_of
 from ..schedule import divides_after, divides_now
 from ..state.status import Loop, SolveStatus
-from ..state.structs import CUT_SHORT, FROZEN, NO_NODE, NOT_PLACED, PLACED, DividingPlanes, Step
+from ..state.structs import CUT_SHORT, FROZEN, NOT_PLACED, PLACED, DividingPlanes, Step
 from ..state.vectors import HALF, ZERO, to_double
 from ..tuning import CLOSE_MARGIN, CLOSE_TOGETHER, FAR_APART, MARGIN, MAX_PASSES, SLACK
 from .vertex_projection import position_on_sides, position_on_way
@@ -32,7 +32,7 @@ def want(planes: DividingPlanes, vertex: int, end: wp.vec3):
 
 @wp.kernel
 def begin_passes(step: Step, planes: DividingPlanes, particles: int, worlds: int, status: SolveStatus):
-    """Lets each particle begin at its start, and want the end that it had when it got its first plane."""
+    """Lets each particle begin at its start, and want the end that it had when it got its first plane; begins lists."""
     i = wp.tid()
     if i == 0:
         status.loop[Loop.PASS] = 0
@@ -43,10 +43,12 @@ def begin_passes(step: Step, planes: DividingPlanes, particles: int, worlds: int
             status.idle[i] = status.idle[i] + 1  # until something moves
         planes.moved[i] = 0
         planes.missed[i] = 0
-    if i < particles and planes.first[i] != NO_NODE:
-        planes.reached[i] = step.motion.x0[i]
-        if planes.placed[i] == NOT_PLACED:
-            want(planes, i, step.vertices.x1[i])
+    if i < planes.number.shape[0] and planes.number[i] > 0:
+        begin_list(planes, i)
+        if i < particles:
+            planes.reached[i] = step.motion.x0[i]
+            if planes.placed[i] == NOT_PLACED:
+                want(planes, i, step.vertices.x1[i])
 
 
 @wp.struct
@@ -96,6 +98,8 @@ def _side(
 @wp.func
 def _place_plane(step: Step, planes: DividingPlanes, status: SolveStatus, plane: int):
     loop = status.loop
+    if loop[Loop.PASS] <= 1:  # if read too early, it is listed twice
+        add_to_lists(step.motion, planes, plane)
     if planes.vertices[plane][3] < 0:
         return
     corners = planes.vertices[plane]
@@ -137,6 +141,7 @@ def place_planes(step: Step, planes: DividingPlanes, status: SolveStatus, thread
     if wp.tid() == 0:
         loop[Loop.PASS] = loop[Loop.PASS] + 1
         loop[Loop.MORE_PASSES] = 0
+        planes.listed[0] = wp.int64(0)
     for plane in range(wp.tid(), wp.min(planes.count[0], planes.place.shape[0]), threads):
         _place_plane(step, planes, status, plane)
 
@@ -149,7 +154,7 @@ def move_to_sides(step: Step, planes: DividingPlanes, tolerance: wp.float64, sta
     """
     particle = wp.tid()
     world = step.motion.world[particle]
-    if planes.first[particle] < 0 or not divides_now(status, world):
+    if planes.number[particle] == 0 or not divides_now(status, world):
         return
     if step.motion.inverse_mass[particle] == 0.0 or step.vertices.outcome[particle] & FROZEN != 0:
         return

@@ -35,7 +35,6 @@ from .status import Detection, Loop, Result, SolveStatus, WorldCounts, clear_sta
 from .structs import (
     FROZEN,
     NEVER,
-    NO_NODE,
     NOT_FINITE,
     NOT_PLACED,
     SUMS,
@@ -91,7 +90,7 @@ def _begin(step: Step, worlds: int, dividing: DividingPlanes, status: SolveStatu
         left = wp.where(vertices.outcome[i] & FROZEN != 0, STUCK_STEPS, vertices.frozen_lately[i] - 1)
         vertices.frozen_lately[i] = wp.where(continues(motion, motion.world[i]), wp.max(left, 0), 0)
     vertices.outcome[i] = wp.where(motion.is_not_finite[i] != 0, NOT_FINITE, 0)
-    dividing.first[i] = NO_NODE
+    dividing.number[i] = 0
     dividing.lacks[i] = 0
     dividing.placed[i] = NOT_PLACED
 
@@ -212,8 +211,9 @@ class Workspace(Launches):
         step.constraints = self._allocate_constraints(0)
         self._retired: list[wp.array] = []
         capacity = (DIVIDING_PLANES_IF_FEW if has_few_contacts else DIVIDING_PLANES) * self.particle_count
-        sizes = {"count": 1, "next": 4 * capacity, "moved": self.worlds, "missed": self.worlds}
-        sizes |= dict.fromkeys(("first", "lacks", "placed", "wanted", "reached"), vertices)
+        sizes = {"count": 1, "listed": 1, "moved": self.worlds, "missed": self.worlds}
+        sizes |= dict.fromkeys(("rank", "sides"), 4 * capacity)
+        sizes |= dict.fromkeys(("number", "begin", "lacks", "placed", "wanted", "reached"), vertices)
         self.dividing = allocate(DividingPlanes, capacity, device, **sizes, half=self._if_distances(capacity))
         self.status = _allocate_status(self.worlds, device, max_iterations)
         self.loop, self.results = single_elements(self.status.loop), single_elements(self.status.results)
