@@ -324,12 +324,18 @@ class DetectionPipeline:
         self.counters.array.zero_()
         self.broad_phase.pair_edges_with_faces(x, self.edge_edge.counts, self.edge_edge.queue)
 
-    def find_overlapping(self, x0: wp.array, x1: wp.array) -> None:
-        """Enqueues all pairs whose swept boxes overlap, as :meth:`find_candidates` does those that it finds."""
+    def find_overlapping(self, x0: wp.array, x1: wp.array, *, again: bool = False) -> None:
+        """Enqueues all pairs whose swept boxes overlap, as :meth:`find_candidates` does those that it finds.
+
+        Where it is ``again``, as of :meth:`.BroadPhaseHierarchy.pair_elements`, the count of pairs of faces stays.
+        """
         self._pad_arcs()
-        self.counters.array.zero_()
+        if again:
+            self.counters.pairs.zero_()
+        else:
+            self.counters.array.zero_()
         queues = _queues(self.vertex_face, self.edge_edge)
-        self.broad_phase.pair_elements(x0, x1, *queues, keep_separated=True)
+        self.broad_phase.pair_elements(x0, x1, *queues, keep_separated=True, again=again)
 
     def grow(self) -> bool:
         """Enlarges the buffers that were too small in the last run; synchronizes with the device.

@@ -19,7 +19,7 @@ from .drive.coupling import CouplingHooks
 from .drive.inner_steps import InnerSteps, StepCall
 from .drive.snapshot import Snapshot
 from .drive.world_mask import WorldMask, checked_mask
-from .report.count_steps import count_step, merge_step, note_crossings
+from .report.count_steps import count_step, merge_step
 from .report.count_worlds import WorldCounter
 from .report.report import SolverReport
 from .report.text import unseen_warning
@@ -241,7 +241,6 @@ class CollisionStage(CouplingHooks):
         size = max(self.mesh.vertex_count, work.body_count, len(found.results))
         inputs = [work.step, work.status, work.particle_count, self._responds, first]
         work.launch(merge_step, size, inputs, [found])
-        work.launch(note_crossings, 1, [work.status])
         if self._counter is not None:
             self._counter.count(first=first)
         if step.is_last:

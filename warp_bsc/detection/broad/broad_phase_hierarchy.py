@@ -119,7 +119,13 @@ class BroadPhaseHierarchy:
         self.hierarchy.filtered_of_worlds = counts
 
     def pair_elements(
-        self, x0: wp.array, x1: wp.array, *out: wp.array, changed: wp.array | None = None, keep_separated: bool = False
+        self,
+        x0: wp.array,
+        x1: wp.array,
+        *out: wp.array,
+        changed: wp.array | None = None,
+        keep_separated: bool = False,
+        again: bool = False,
     ) -> None:
         """Enqueues the candidates.
 
@@ -132,12 +138,14 @@ class BroadPhaseHierarchy:
             changed: Nonzero for each vertex whose pairs are sought, array of int; None for all. More than 1, by body,
                 for those of rigid bodies, within which none are. What is not sought may be found as well.
             keep_separated: Whether to enqueue the pairs that an axis separates, too.
+            again: Whether the pairs of faces of the run before, which kept those too, have all that is sought, as each
+                position is between its two of that run; only a large mesh then is traversed again.
         """
         queues = [_queue_of(*queue) for queue in zip(out[::2], out[1::2], strict=True)]
         launches: list[_LaunchOverFaces] = [(pair_elements_kernel, queues[:2])]
         if self._has_points and queues[2:]:
             launches.append((pair_points_kernel, queues[2:]))
-        self.pair_faces(x0, x1, changed, keep_separated, *launches)
+        self.pair_faces(x0, x1, changed, keep_separated, *launches, again=again)
 
     def pair_edges_with_faces(self, x: wp.array, counts: wp.array, pairs: wp.array, *, is_end: bool = False) -> None:
         """Enqueues the pairs (edge, face) of one configuration that share no vertex and whose boxes overlap.
@@ -151,15 +159,29 @@ class BroadPhaseHierarchy:
         """
         self.pair_faces(x, x, None, False, (pair_edges_with_faces_kernel, [_queue_of(counts, pairs)]))
 
-    def fit(self, x0: wp.array, x1: wp.array, changed: wp.array | None = None, *, keep_separated: bool = False) -> None:
-        """Writes the corners and the boxes of all faces, and boxes all nodes; arguments as of :meth:`pair_elements`."""
+    def fit(
+        self,
+        x0: wp.array,
+        x1: wp.array,
+        changed: wp.array | None = None,
+        *,
+        keep_separated: bool = False,
+        only_rows: bool = False,
+    ) -> None:
+        """Writes the corners and the boxes of all faces, and boxes all nodes; arguments as of :meth:`pair_elements`.
+
+        With ``only_rows``, boxes of nodes stay as they are, and without a padding those of faces.
+        """
         tree, options = self.hierarchy, {"device": self._device, "record_tape": False}
         if not self.is_padded or self._not_finite is not None:
             inputs, outputs = [x0, x1, self._checked], [None if self.is_padded else tree.corners, self._not_finite]
             launch(round_kernel(x0.dtype), self._vertex_count, inputs=inputs, outputs=outputs, **options)
         tree.swept = keep_separated
         inputs = [x0, x1, changed, self._padding, tree]
-        launch(fit_kernel(x0.dtype, self.is_padded), len(tree.order), inputs=inputs, **options)
+        if self.is_padded or not only_rows:
+            launch(fit_kernel(x0.dtype, self.is_padded), len(tree.order), inputs=inputs, **options)
+        if only_rows:
+            return
         for children, parents in ((tree.clusters, tree.bundles), (tree.bundles, tree.groups)):
             if parents.boxes is not None:
                 launch(box_parents, WIDTH * len(parents.boxes), inputs=[children, parents], **options)
@@ -184,6 +206,7 @@ class BroadPhaseHierarchy:
         changed: wp.array | None = None,
         keep_separated: bool = False,
         *launches: _LaunchOverFaces,
+        again: bool = False,
     ) -> None:
         """Enqueues the pairs of faces that no axis separates and few others, or all whose swept boxes overlap.
 
@@ -191,8 +214,9 @@ class BroadPhaseHierarchy:
         functions that make a kernel for boxes with a padding or without, swept or not, and its inputs, which follow the
         hierarchy and the queue; its last one is its threads.
         """
-        self.fit(x0, x1, changed, keep_separated=keep_separated)
         parts = len(self._part_counts)
+        traverses = parts > 1 or not again
+        self.fit(x0, x1, changed, keep_separated=keep_separated, only_rows=not traverses)
         if parts > 1:
             self._part_counts.zero_()
         options = {"device": self._device, "record_tape": False}
@@ -201,7 +225,8 @@ class BroadPhaseHierarchy:
             count = self._part_counts[part : part + 1] if parts > 1 else self._count
             ends = [self._clusters * i // parts for i in (part, part + 1)]
             pairs = _queue_of(count, self.face_pairs)
-            self.traverse(traversal_kernel(_enqueue_faces, Pairs, self.is_padded), pairs, *ends)
+            if traverses:
+                self.traverse(traversal_kernel(_enqueue_faces, Pairs, self.is_padded), pairs, *ends)
             for make_kernel, inputs in launches:
                 kernel = make_kernel(self.is_padded, keep_separated)
                 launch(kernel, threads, inputs=[self.hierarchy, pairs, *inputs, threads], **options)

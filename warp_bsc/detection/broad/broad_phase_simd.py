@@ -67,9 +67,16 @@ class BroadPhaseSimd:
         self._filtered_of_worlds = counts
 
     def pair_elements(
-        self, x0: wp.array, x1: wp.array, *out: wp.array, changed: wp.array | None = None, keep_separated: bool = False
+        self,
+        x0: wp.array,
+        x1: wp.array,
+        *out: wp.array,
+        changed: wp.array | None = None,
+        keep_separated: bool = False,
+        again: bool = False,
     ) -> None:
-        """Enqueues the candidates."""
+        """Enqueues the candidates, which are not kept for a run ``again``."""
+        del again
         trees = [self._vertices, self._edges, self._faces]
         if self._edges_of_faces:
             trees.append(self._edges_of_faces)

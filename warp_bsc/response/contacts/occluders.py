@@ -110,5 +110,6 @@ def clip_paths(
         direction = _direction(path)
         axis = direction / 2
         limit = float(BEHIND) * nearest[vertex, direction]
-        end[axis] = x0[axis] + wp.clamp(end[axis] - x0[axis], -limit, limit)
+        clipped = x0[axis] + wp.clamp(end[axis] - x0[axis], -limit, limit)
+        end[axis] = wp.clamp(clipped, wp.min(x0[axis], end[axis]), wp.max(x0[axis], end[axis]))  # not even by rounding
     ends[vertex] = end

@@ -193,5 +193,5 @@ def _collect(work, ends):
         inputs = [work.step, *queues, work.nearest, work.status]
         work.launch_over_entries(collect_proximities, inputs, is_large=True)
 
-    retry_until_fits(lambda: detector.find_overlapping(x0, ends), detector, work.device)
+    retry_until_fits(lambda: detector.find_overlapping(x0, ends, again=True), detector, work.device)
     retry_until_fits(collect, work, work.device)

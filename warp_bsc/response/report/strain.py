@@ -4,6 +4,7 @@ import newton
 import numpy as np
 import warp as wp
 
+from ..state.extremes import raise_to
 from ..state.structs import Motion
 from ..state.workspace import Workspace
 from ..tuning import COMPRESSION, SOLID
@@ -36,9 +37,8 @@ def measure_strain(
     change = wp.max(length - wp.max(start, lengths[i]), COMPRESSION * (wp.min(start, lengths[i]) - length))
     if is_solid[i]:
         change = SOLID * wp.abs(length - start)
-    world = motion.world[a]
-    if change > strain[world] * lengths[i]:  # few atomic operations, which all are on one number
-        wp.atomic_max(strain, world, change / lengths[i])
+    if change > 0.0:
+        raise_to(strain, motion.world[a], change / lengths[i])
 
 
 class StrainMeter:

@@ -81,6 +81,7 @@ class SolveStatus:
     is_stuck: wp.array[int]  # of each world, 1 if a vertex collides that was frozen lately
     is_fast: wp.array[int]  # of each world, 1 if predicted paths of fast or pushing elements or bodies collide
     crossings: wp.array[int]  # of each world, edges that cross faces at the start
+    arrived: wp.array[int]  # how often blocks have waited for each other in these sweeps, see team.wait_for_team
     of_worlds: WorldCounts
     max_iterations: int
     max_slow_iterations: int
@@ -127,6 +128,7 @@ def begin_sweeps(status: SolveStatus):
     loop[Loop.SWEEP] = 0
     loop[Loop.MORE_SWEEPS] = wp.where(loop[Loop.ACTIVE] == 0 or loop[Loop.PROJECTING] == 1, 1, 0)
     loop[Loop.PROJECTING] = 0
+    status.arrived[0] = 0
 
 
 @wp.kernel

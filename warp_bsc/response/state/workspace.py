@@ -27,7 +27,6 @@ from ..tuning import (
     THREADS,
     TOLERANCE,
 )
-from .cluster import BLOCK, begin_worlds, count_constraints, list_constraints, threads_of_world
 from .launches import Launches
 from .mesh import ModelMesh, grouped_by_world
 from .motion import ModelMotion, continues, takes_part
@@ -46,6 +45,15 @@ from .structs import (
     Tetrahedra,
     Vertices,
     allocate,
+)
+from .team import (
+    BLOCK,
+    LARGE_BLOCK,
+    begin_worlds,
+    count_constraints,
+    list_constraints,
+    threads_of_large_team,
+    threads_of_world,
 )
 
 wp.set_module_options({"enable_backward": False})
@@ -121,6 +129,7 @@ def _allocate_status(worlds: int, device: wp.Device, max_iterations: int) -> Sol
         setattr(status, name, wp.zeros(len(fields), dtype=int, device=device))
     for name in ("contact_iteration", "idle", "is_stuck", "is_fast", "crossings"):
         setattr(status, name, wp.zeros(worlds, dtype=int, device=device))
+    status.arrived = wp.zeros(1, dtype=int, device=device)
     status.max_iterations = max_iterations
     status.max_slow_iterations = MAX_SLOW_ITERATIONS
     status.max_divisions = MAX_DIVISIONS
@@ -207,6 +216,7 @@ class Workspace(Launches):
         self.particles = self._find_particles()
         largest = int(np.diff(self.particles.first.numpy()).max())
         self.sweeping_threads = 0 if self.body_count else threads_of_world(device, self.worlds, largest)
+        self._large_team = 0 if self.body_count else threads_of_large_team(device)
         self._iterations_reserved = ITERATIONS_RESERVED_IF_FEW if has_few_contacts else ITERATIONS_RESERVED
         step.constraints = self._allocate_constraints(0)
         self._retired: list[wp.array] = []
@@ -341,7 +351,7 @@ class Workspace(Launches):
         return True
 
     def sweep_by_world(self, kernel: Callable[[int], wp.Kernel], inputs: Sequence) -> None:
-        """Launches a kernel that makes all sweeps over each world, of a number of blocks, see :mod:`.cluster`.
+        """Launches a kernel that makes all sweeps over each world, of a number of blocks, see :mod:`.team`.
 
         Its first inputs are the step and the particles of worlds, its last one is the threads of a world.
         """
@@ -356,18 +366,28 @@ class Workspace(Launches):
         options = {"device": self.device, "block_dim": min(threads, BLOCK)}
         wp.launch(kernel(max(1, threads // BLOCK)), self.worlds * threads, inputs=inputs, **options)
 
-    def sweep(self, number: int, activate: Callable[[], None], project: wp.Kernel, update: Callable) -> None:
+    def sweep(
+        self, number: int, activate: Callable[[], None], together: wp.Kernel, project: wp.Kernel, update: Callable
+    ) -> None:
         """Sweeps a number of times over one active set, which ``activate`` fills, see :mod:`.solve.sweeps`.
 
-        The kernel ``project`` updates multipliers; then ``update(work, last)`` changes vertices and bodies.
+        The kernel ``together`` makes all sweeps, if there is a :func:`.team.large_team`. Else the kernel ``project``
+        updates multipliers; then ``update(work, last)`` changes vertices and bodies.
         """
         activate()
+        if self._large_team:
+            inputs = [self.step, self.particles, self.status, number, self._large_team]
+            wp.launch(together, self._large_team, inputs=inputs, device=self.device, block_dim=LARGE_BLOCK)
+            return
         for i in range(number):
             self.launch_over_constraints(project, self.status)
             update(self, i == number - 1)
 
-    def repeat_sweeps(self, activate: Callable[[], None], project: wp.Kernel, update: Callable) -> None:
+    def repeat_sweeps(
+        self, activate: Callable[[], None], together: wp.Kernel, project: wp.Kernel, update: Callable
+    ) -> None:
         """Repeats batches of sweeps until no constraint is active, at most MAX_SWEEPS times; none in divided worlds."""
         self.launch(start_sweeps, 1, [self.status])
-        batch = {"number": int(SWEEPS_PER_BATCH), "activate": activate, "project": project, "update": update}
+        kernels = {"together": together, "project": project}
+        batch = {"number": int(SWEEPS_PER_BATCH), "activate": activate, **kernels, "update": update}
         wp.capture_while(self.loop[Loop.MORE_SWEEPS], self.sweep, **batch)

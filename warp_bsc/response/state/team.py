@@ -7,8 +7,8 @@ that run together (compute capability 9.0); on a CPU there is one. Worlds withou
 
 import warp as wp
 
-from .status import SolveStatus, begin_sweeps
-from .structs import Step, constraint_count
+from .status import Loop, SolveStatus, begin_sweeps
+from .structs import Incidence, Step, constraint_count
 
 wp.set_module_options({"enable_backward": False})
 
@@ -18,6 +18,9 @@ SMALLEST_BLOCK = 128
 """Threads of a block at least: 1,024 worlds of fewer, not all of which run at once, took longer than by launches."""
 CLUSTER = 8
 """Blocks of a cluster, the most that every GPU has that has clusters."""
+LARGE_BLOCK, LARGE_BLOCKS = int(__import__("os").environ.get("LB", "512")), 128  # TEMP
+"""Threads of a block, and blocks at most, for the active set of a large world: each thread has 128 registers, and each
+multiprocessor a block, as they wait for each other and must run together."""
 PARTICLES = 4
 """Most particles of a world for each thread: larger worlds need more of the GPU."""
 
@@ -46,6 +49,11 @@ def threads_of_world(device: wp.Device, worlds: int, particles: int) -> int:
     while threads > max(SMALLEST_BLOCK, at_once) and particles <= PARTICLES * threads // 2:
         threads //= 2
     return threads
+
+
+def threads_of_large_team(device: wp.Device) -> int:
+    """Returns how many threads sweep together over a large world; 0 on a CPU, where launches of sweeps cost little."""
+    return 0 if device.is_cpu else LARGE_BLOCK * min(LARGE_BLOCKS, device.sm_count)
 
 
 @wp.func
@@ -85,6 +93,29 @@ def list_constraints(step: Step, threads: int):
 
 @wp.func_native(
     snippet="""
+#if defined(__CUDA_ARCH__)
+    __syncthreads();
+    if (blocks > 1) {
+        if (threadIdx.x == 0) {
+            __threadfence();
+            unsigned* count = (unsigned*)arrived.data + world;
+            const unsigned before = atomicAdd(count, 1u);
+            const unsigned all = (before / blocks + 1u) * blocks;
+            while ((int)(*(volatile unsigned*)count - all) < 0) {}
+            __threadfence();
+        }
+        __syncthreads();
+    }
+#endif
+"""
+)
+def wait_for_team(arrived: wp.array[int], world: int, blocks: int):
+    """Waits until all threads of a world are here, and sees what they have written; its blocks must all be running."""
+    ...
+
+
+@wp.func_native(
+    snippet="""
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
     asm volatile("barrier.cluster.arrive.release;" ::: "memory");
     asm volatile("barrier.cluster.wait.acquire;" ::: "memory");
@@ -93,12 +124,55 @@ def list_constraints(step: Step, threads: int):
 #endif
 """
 )
-def wait_for_others():
-    """Waits for all threads of the world; each then sees what the others wrote. All of them have to call it."""
-    ...
+def _wait_for_cluster(): ...
 
 
-@wp.func_native(snippet="\n#if defined(__CUDA_ARCH__)\n    __syncthreads();\n#endif\n")
-def wait_for_block():
-    """Waits as :func:`wait_for_others`, for those of the same block."""
-    ...
+@wp.struct
+class Team:
+    """The threads that make sweeps over an active set together, and what they work on."""
+
+    thread: int  # number of a thread
+    threads: int  # how many there are
+    block: int  # threads of a block
+    blocks: int  # their blocks; 0 if these are a cluster
+    first: int  # where the active set begins
+    end: int  # and where it ends
+    first_particle: int  # of those that it may move, in the list of the particles of worlds
+    end_particle: int
+    sweep: int  # number of the next sweep
+
+
+@wp.func
+def wait_for_others(status: SolveStatus, blocks: int):
+    """Waits for all threads of a team in so many blocks; each then sees what the others wrote. All must call it."""
+    if blocks == 0:
+        _wait_for_cluster()
+    else:
+        wait_for_team(status.arrived, 0, blocks)
+
+
+@wp.func
+def team_of_world(step: Step, particles: Incidence, world: int, thread: int, threads: int) -> Team:
+    """Returns the team that sweeps over the constraints of one world, without an active set."""
+    team = Team()
+    team.thread = thread
+    team.threads = threads
+    team.block = wp.min(threads, BLOCK)
+    team.first = step.constraints.first[world]
+    team.first_particle = particles.first[world]
+    team.end_particle = particles.first[world + 1]
+    return team
+
+
+@wp.func
+def large_team(step: Step, particles: Incidence, status: SolveStatus, thread: int, threads: int) -> Team:
+    """Returns the team that sweeps over the active set of all worlds together."""
+    team = Team()
+    team.thread = thread
+    team.threads = threads
+    team.block = LARGE_BLOCK
+    team.blocks = wp.max(threads / LARGE_BLOCK, 1)
+    team.end = int(step.constraints.active_count[0])
+    team.end_particle = particles.items.shape[0]
+    team.sweep = status.loop[Loop.SWEEP]
+    return team
