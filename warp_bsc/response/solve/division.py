@@ -34,7 +34,7 @@ from ..state.vectors import ONE, to_double, to_single
 from ..state.workspace import Workspace
 from ..tuning import CUT, SHARE_OF_PATH
 from .bodies import FREEZES, WHOLE_PATH, place_vertices
-from .plane_placement import begin_passes, move_to_sides, place_planes, want
+from .plane_placement import begin_passes, move_to_sides, pass_over_few_planes, place_planes, want
 from .vertex_projection import share_of_path
 
 wp.set_module_options({"enable_backward": False})
@@ -263,6 +263,7 @@ def divide(work: Workspace, dt: float) -> None:
     size = max(len(work.vertices.x1), worlds)
     work.launch_over_constraints(divide_proximities, *changed)
     work.launch(begin_passes, size, [work.step, work.dividing, particles, worlds, work.status])
+    work.launch_in_block(pass_over_few_planes, [work.step, work.dividing, work.tolerance, work.status, particles])
     wp.capture_while(work.loop[Loop.MORE_PASSES], _pass_over_planes, work=work)
     work.launch_over_particles(truncate_vertices, *changed, dt)
     work.launch_over_shape_vertices(find_body_shares, *changed)

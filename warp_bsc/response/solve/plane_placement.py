@@ -11,16 +11,21 @@ apart, follow each other in a few passes. Elements that slide along a plane go o
 
 import warp as wp
 
+from ...kernels.pipeline.queues import take_slot_int
 from ..contacts.planes_between import FAR, add_to_lists, begin_list
 from ..contacts.rules import inverse_mass_of
 from ..schedule import divides_after, divides_now
 from ..state.status import Loop, SolveStatus
 from ..state.structs import CUT_SHORT, FROZEN, NOT_PLACED, PLACED, DividingPlanes, Step
+from ..state.team import BLOCK, wait_for_block
 from ..state.vectors import HALF, ZERO, to_double
 from ..tuning import CLOSE_MARGIN, CLOSE_TOGETHER, FAR_APART, MARGIN, MAX_PASSES, SLACK
 from .vertex_projection import position_on_sides, position_on_way
 
 wp.set_module_options({"enable_backward": False})
+
+FEW_PLANES = wp.constant(BLOCK)
+"""Planes up to which one block of threads makes all passes, a plane each."""
 
 
 @wp.func
@@ -36,7 +41,7 @@ def begin_passes(step: Step, planes: DividingPlanes, particles: int, worlds: int
     i = wp.tid()
     if i == 0:
         status.loop[Loop.PASS] = 0
-        status.loop[Loop.MORE_PASSES] = wp.where(planes.count[0] > 0, 1, 0)
+        status.loop[Loop.MORE_PASSES] = wp.where(planes.count[0] > FEW_PLANES, 1, 0)
     if i < worlds:
         before = status.loop[Loop.ITERATION] - 1
         if status.contact_iteration[i] == before and divides_after(status, i, before):
@@ -45,6 +50,7 @@ def begin_passes(step: Step, planes: DividingPlanes, particles: int, worlds: int
         planes.missed[i] = 0
     if i < planes.number.shape[0] and planes.number[i] > 0:
         begin_list(planes, i)
+        planes.listed_vertices[take_slot_int(planes.vertex_count)] = i
         if i < particles:
             planes.reached[i] = step.motion.x0[i]
             if planes.placed[i] == NOT_PLACED:
@@ -130,6 +136,14 @@ def _place_plane(step: Step, planes: DividingPlanes, status: SolveStatus, plane:
     planes.margin[plane] = float(margin)
 
 
+@wp.func
+def _begin_pass(planes: DividingPlanes, status: SolveStatus):
+    """Counts a pass, which is the last one unless a vertex asks for another; the lists of vertices are complete."""
+    status.loop[Loop.PASS] = status.loop[Loop.PASS] + 1
+    status.loop[Loop.MORE_PASSES] = 0
+    planes.listed[0] = wp.int64(0)
+
+
 @wp.kernel
 def place_planes(step: Step, planes: DividingPlanes, status: SolveStatus, threads: int):
     """Places each plane where both elements would meet by their masses, but between what they have reached.
@@ -137,22 +151,18 @@ def place_planes(step: Step, planes: DividingPlanes, status: SolveStatus, thread
     Nor is it within a vertex that cannot be moved, which may have passed what the other has reached. Elements come no
     nearer to each other than a share of their distance at the start, or of ``FAR_APART`` separations.
     """
-    loop = status.loop
     if wp.tid() == 0:
-        loop[Loop.PASS] = loop[Loop.PASS] + 1
-        loop[Loop.MORE_PASSES] = 0
-        planes.listed[0] = wp.int64(0)
+        _begin_pass(planes, status)
     for plane in range(wp.tid(), wp.min(planes.count[0], planes.place.shape[0]), threads):
         _place_plane(step, planes, status, plane)
 
 
-@wp.kernel
-def move_to_sides(step: Step, planes: DividingPlanes, tolerance: wp.float64, status: SolveStatus):
-    """Moves each particle as near to where it wants to end as its planes let it come.
+@wp.func
+def _move_to_sides(step: Step, planes: DividingPlanes, tolerance: wp.float64, status: SolveStatus, particle: int):
+    """Moves a particle as near to where it wants to end as its planes let it come.
 
     A world needs another pass if one of its particles is not there, and one has moved by more than the tolerance.
     """
-    particle = wp.tid()
     world = step.motion.world[particle]
     if planes.number[particle] == 0 or not divides_now(status, world):
         return
@@ -178,3 +188,34 @@ def move_to_sides(step: Step, planes: DividingPlanes, tolerance: wp.float64, sta
     if wp.length_sq(end - wanted) > 0.0:
         planes.missed[world] = passes
         status.loop[Loop.MORE_PASSES] = 1
+
+
+@wp.kernel
+def move_to_sides(step: Step, planes: DividingPlanes, tolerance: wp.float64, status: SolveStatus):
+    """Moves each particle as near to where it wants to end as its planes let it come."""
+    _move_to_sides(step, planes, tolerance, status, wp.tid())
+
+
+@wp.kernel(module="unique", enable_backward=False, launch_bounds=BLOCK)
+def pass_over_few_planes(
+    step: Step, planes: DividingPlanes, tolerance: wp.float64, status: SolveStatus, particles: int, threads: int
+):
+    """Makes all passes over at most ``FEW_PLANES``, in one block of threads: the launches of more take longer."""
+    thread = wp.tid()
+    count, vertices = int(planes.count[0]), int(planes.vertex_count[0])
+    more = count > 0 and count <= FEW_PLANES
+    while more:
+        wait_for_block()
+        if thread == 0:
+            _begin_pass(planes, status)
+        wait_for_block()
+        for plane in range(thread, wp.min(count, planes.place.shape[0]), threads):
+            _place_plane(step, planes, status, plane)
+        wait_for_block()
+        for i in range(thread, vertices, threads):
+            if planes.listed_vertices[i] < particles:
+                _move_to_sides(step, planes, tolerance, status, planes.listed_vertices[i])
+        wait_for_block()
+        more = status.loop[Loop.MORE_PASSES] == 1
+    if thread == 0:
+        planes.vertex_count[0] = 0

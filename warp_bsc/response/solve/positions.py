@@ -10,7 +10,7 @@ from ..schedule import divides_after, is_reversible, projects_now
 from ..state.fixed_sum import with_delta
 from ..state.status import Loop, SolveStatus, start_sweeps
 from ..state.structs import PROJECTED, ContactKind, Incidence, Pace, Step, constraint_at, constraint_count
-from ..state.team import BLOCK, LARGE_BLOCK, Team, large_team, team_of_world, wait_for_others
+from ..state.team import BLOCK, LARGE_BLOCK, Team, in_one_block, large_team, team_of_world, wait_for_others
 from ..state.vectors import ONE, ZERO, relative
 from ..state.workspace import Workspace
 from ..tuning import (
@@ -232,12 +232,14 @@ def _sweep(cluster: int) -> wp.Kernel:
         team = team_of_world(step, particles, world, wp.tid() - world * threads, threads)
         first = team.first
         end = first + step.constraints.number[world]
-        team.sweep = wp.where(status.loop[Loop.MORE_SWEEPS] == 1 and end > first, 0, most)
+        team = in_one_block(team, end - first)
+        sweeps_now = status.loop[Loop.MORE_SWEEPS] == 1 and end > first and team.thread < team.threads
+        team.sweep = wp.where(sweeps_now, 0, most)
         while team.sweep < most:
             if team.thread == 0:
                 step.constraints.active_count[world] = wp.int64(0)
             wait_for_others(status, team.blocks)
-            for place in range(first + team.thread, end, threads):
+            for place in range(first + team.thread, end, team.threads):
                 i = constraint_at(step, place)
                 if _is_active(step, status, team.sweep, tolerance, i):
                     sweeps.activate(step, i, world, first)

@@ -9,7 +9,7 @@ from ..contacts.constraints import NEVER_SWEPT, gap, has_pushed, min_distance_of
 from ..state.fixed_sum import with_delta
 from ..state.status import Loop, SolveStatus
 from ..state.structs import Incidence, Step, constraint_at, constraint_count, has_final_velocity
-from ..state.team import BLOCK, LARGE_BLOCK, Team, large_team, team_of_world, wait_for_others
+from ..state.team import BLOCK, LARGE_BLOCK, Team, in_one_block, large_team, team_of_world, wait_for_others
 from ..state.vectors import ONE, ZERO, relative
 from ..state.workspace import Workspace
 from ..tuning import MAX_SWEEPS, SWEEPS_PER_BATCH, TOLERANCE_OF_BODIES
@@ -242,11 +242,13 @@ def _sweep(cluster: int) -> wp.Kernel:
         wait_for_others(status, team.blocks)
         _update(step, particles, True, team)
         wait_for_others(status, team.blocks)
-        while team.sweep < MAX_SWEEPS:
+        team = in_one_block(team, end - first)
+        most = wp.where(thread < team.threads, int(MAX_SWEEPS), 0)
+        while team.sweep < most:
             if thread == 0:
                 step.constraints.active_count[world] = wp.int64(0)
             wait_for_others(status, team.blocks)
-            for place in range(first + thread, end, threads):
+            for place in range(first + thread, end, team.threads):
                 i = constraint_at(step, place)
                 if _is_active(step, tolerance, i):
                     sweeps.activate(step, i, world, first)
@@ -257,10 +259,11 @@ def _sweep(cluster: int) -> wp.Kernel:
             _make_batch(step, particles, status, team, batch)
             wait_for_others(status, team.blocks)
             team.sweep += batch
+        wait_for_others(status, 0)
         add_torques(step, first + thread, end, threads, sums)
-        wait_for_others(status, team.blocks)
+        wait_for_others(status, 0)
         add_moments(step, particles, team.first_particle + thread, team.end_particle, threads, sums)
-        wait_for_others(status, team.blocks)
+        wait_for_others(status, 0)
         for k in range(team.first_particle + thread, team.end_particle, threads):
             turn_vertex(step, sums, particles.items[k])
 

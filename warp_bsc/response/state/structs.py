@@ -261,6 +261,8 @@ class DividingPlanes:
     begin: wp.array[int]  # of a vertex, where its list begins
     sides: wp.array[int]  # the lists: twice a plane, and 1 more of a vertex that stays below
     listed: wp.array[wp.int64]  # length of all lists that have begun
+    listed_vertices: wp.array[int]  # vertices that have planes
+    vertex_count: wp.array[int]  # their number
     lacks: wp.array[int]  # of a vertex, 1 if it has contacts without a plane
     placed: wp.array[int]  # of a vertex: NOT_PLACED, PLACED or CUT_SHORT
     wanted: wp.array[wp.vec3]  # where a vertex is to end, as near as its planes let it come [m]

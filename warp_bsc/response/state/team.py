@@ -127,6 +127,12 @@ def wait_for_team(arrived: wp.array[int], world: int, blocks: int):
 def _wait_for_cluster(): ...
 
 
+@wp.func_native(snippet="\n#if defined(__CUDA_ARCH__)\n    __syncthreads();\n#endif\n")
+def wait_for_block():
+    """Waits for all threads of a block; each then sees what the others wrote. All of them have to call it."""
+    ...
+
+
 @wp.struct
 class Team:
     """The threads that make sweeps over an active set together, and what they work on."""
@@ -161,6 +167,15 @@ def team_of_world(step: Step, particles: Incidence, world: int, thread: int, thr
     team.first = step.constraints.first[world]
     team.first_particle = particles.first[world]
     team.end_particle = particles.first[world + 1]
+    return team
+
+
+@wp.func
+def in_one_block(team: Team, constraints: int) -> Team:
+    """Returns the first block of a team for a world of few constraints, as it waits less; else the team."""
+    if constraints <= 2 * team.block:
+        team.blocks = 1
+        team.threads = team.block
     return team
 
 

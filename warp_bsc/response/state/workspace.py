@@ -221,9 +221,9 @@ class Workspace(Launches):
         step.constraints = self._allocate_constraints(0)
         self._retired: list[wp.array] = []
         capacity = (DIVIDING_PLANES_IF_FEW if has_few_contacts else DIVIDING_PLANES) * self.particle_count
-        sizes = {"count": 1, "listed": 1, "moved": self.worlds, "missed": self.worlds}
+        sizes = {"count": 1, "listed": 1, "vertex_count": 1, "moved": self.worlds, "missed": self.worlds}
         sizes |= dict.fromkeys(("rank", "sides"), 4 * capacity)
-        sizes |= dict.fromkeys(("number", "begin", "lacks", "placed", "wanted", "reached"), vertices)
+        sizes |= dict.fromkeys(("number", "begin", "listed_vertices", "lacks", "placed", "wanted", "reached"), vertices)
         self.dividing = allocate(DividingPlanes, capacity, device, **sizes, half=self._if_distances(capacity))
         self.status = _allocate_status(self.worlds, device, max_iterations)
         self.loop, self.results = single_elements(self.status.loop), single_elements(self.status.results)
