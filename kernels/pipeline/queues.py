@@ -27,33 +27,6 @@ def _raising(count: str, number: str, threads: str = "__activemask()") -> str:
 """
 
 
-def _taking(bits: int) -> str:
-    """Returns the native code that raises a count by an amount of so many bits, and returns its old value."""
-    return f"""
-#if defined(__CUDA_ARCH__)
-    // one atomic for all threads of a warp that are here; the sum over lower lanes, bit by bit
-    const unsigned mask = __activemask();
-    const int lane = threadIdx.x & 31;
-    const unsigned lower = (1u << lane) - 1u;
-    int before = 0;
-    int total = 0;
-    for (int bit = 0; bit < {bits}; ++bit) {{
-        const unsigned with_bit = __ballot_sync(mask, (amount >> bit) & 1);
-        before += __popc(with_bit & lower) << bit;
-        total += __popc(with_bit) << bit;
-    }}
-    const int leader = __ffs(mask) - 1;
-    unsigned long long base = 0;
-    if (lane == leader && total > 0)
-        base = atomicAdd((unsigned long long*)&counts.data[queue], (unsigned long long)total);
-    base = __shfl_sync(mask, base, leader);
-    return (wp::int64)base + before;
-#else
-    return amount == 0 ? 0 : __atomic_fetch_add(&counts.data[queue], (wp::int64)amount, __ATOMIC_RELAXED);
-#endif
-"""
-
-
 @wp.func_native(snippet=_raising("counts.data[queue]", "unsigned long long"))
 def take_slot(counts: wp.array[wp.int64], queue: int) -> wp.int64:
     """Raises the count of a queue by one, and returns its old value: the index of the new entry."""
@@ -72,18 +45,36 @@ def take_slot_of(counts: wp.array[int], queue: int) -> int:
     ...
 
 
-@wp.func_native(snippet=_taking(6))
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    // one atomic for all threads of a warp that are here; the sum over lower lanes, bit by bit
+    const unsigned mask = __activemask();
+    const int lane = threadIdx.x & 31;
+    const unsigned lower = (1u << lane) - 1u;
+    int before = 0;
+    int total = 0;
+    for (int bit = 0; bit < 6; ++bit) {
+        const unsigned with_bit = __ballot_sync(mask, (amount >> bit) & 1);
+        before += __popc(with_bit & lower) << bit;
+        total += __popc(with_bit) << bit;
+    }
+    const int leader = __ffs(mask) - 1;
+    unsigned long long base = 0;
+    if (lane == leader && total > 0)
+        base = atomicAdd((unsigned long long*)&counts.data[queue], (unsigned long long)total);
+    base = __shfl_sync(mask, base, leader);
+    return (wp::int64)base + before;
+#else
+    return amount == 0 ? 0 : __atomic_fetch_add(&counts.data[queue], (wp::int64)amount, __ATOMIC_RELAXED);
+#endif
+"""
+)
 def take_slots(counts: wp.array[wp.int64], queue: int, amount: int) -> wp.int64:
     """Raises the count of a queue by an amount, and returns its old value: the index of the first entry.
 
     On a GPU the amount must be below 64.
     """
-    ...
-
-
-@wp.func_native(snippet=_taking(24))
-def take_many_slots(counts: wp.array[wp.int64], queue: int, amount: int) -> wp.int64:
-    """Does what :func:`take_slots` does for amounts below 2^24, in more time."""
     ...
 
 

@@ -19,15 +19,10 @@ _MOST_LISTED = 31
 
 
 class ElementsOfParts(NamedTuple):
-    """The elements that have each part, such as the faces of each edge.
+    """The elements that have each part, such as the faces of each edge."""
 
-    Attributes:
-        first: Where the elements of each part begin, int, shape [part_count + 1].
-        elements: The elements, ascending for each part, int, shape [n].
-    """
-
-    first: np.ndarray
-    elements: np.ndarray
+    first: np.ndarray  # where the elements of each part begin, int, shape [part_count + 1]
+    elements: np.ndarray  # the elements, ascending for each part, int, shape [n]
 
     @classmethod
     def of(cls, parts: np.ndarray, count: int) -> "ElementsOfParts":

@@ -327,15 +327,16 @@ class DetectionPipeline:
     def find_overlapping(self, x0: wp.array, x1: wp.array, *, again: bool = False) -> None:
         """Enqueues all pairs whose swept boxes overlap, as :meth:`find_candidates` does those that it finds.
 
-        Where it is ``again``, as of :meth:`.BroadPhaseHierarchy.pair_elements`, the count of pairs of faces stays.
+        Where ``again``, see :meth:`.BroadPhaseHierarchy.pair_elements_again`, pairs of faces stay counted.
         """
         self._pad_arcs()
+        queues = _queues(self.vertex_face, self.edge_edge)
         if again:
             self.counters.pairs.zero_()
+            self.broad_phase.pair_elements_again(x0, x1, *queues)
         else:
             self.counters.array.zero_()
-        queues = _queues(self.vertex_face, self.edge_edge)
-        self.broad_phase.pair_elements(x0, x1, *queues, keep_separated=True, again=again)
+            self.broad_phase.pair_elements(x0, x1, *queues, keep_separated=True)
 
     def grow(self) -> bool:
         """Enlarges the buffers that were too small in the last run; synchronizes with the device.

@@ -189,38 +189,34 @@ def decide(step: Step, counts: wp.array[wp.int64], capacities: wp.array[wp.int64
     loop = status.loop
     detection = status.detection
     results = status.results
-    # one thread waits for all that it reads at once, if it reads it before it writes anything
-    iteration, frozen = int(loop[Loop.ITERATION]), int(loop[Loop.NEWLY_FROZEN])
-    hits, still_open = int(detection[Detection.HITS]), int(detection[Detection.OPEN])
-    excluded, of_bodies = int(detection[Detection.EXCLUDED]), int(detection[Detection.OF_BODIES])
-    too_near, left_out = int(detection[Detection.TOO_NEAR]), int(detection[Detection.FILTERED])
-    inverting, counted = int(results[Result.INVERTING]), int(results[Result.COUNTED])
-    first_hits, iterations = int(results[Result.FIRST_HITS]), int(results[Result.ITERATIONS])
-    constraints, filtered = int(step.constraints.count[0]), _count_filtered(counts, left_out)
-    are_finite = counts[Counter.NOT_FINITE] == wp.int64(0)
-    searches = int(loop[Loop.SEARCHING]) == 0 and has_overflowed(counts, capacities)
-    clear_detection(status)
-    if searches:
+    if loop[Loop.SEARCHING] == 0 and has_overflowed(counts, capacities):
         loop[Loop.SEARCHING] = 1
-        loop[Loop.ITERATION] = wp.max(iteration, status.max_iterations)
+        clear_detection(status)
+        loop[Loop.ITERATION] = wp.max(loop[Loop.ITERATION], status.max_iterations)
         return
     loop[Loop.SEARCHING] = 0
-    loop[Loop.NEWLY_FROZEN] = 0
-    finished = still_open == 0 and too_near == 0 and inverting == 0 and (hits == 0 or frozen == 0)
-    is_last = iteration > status.max_iterations + status.max_divisions
-    more = wp.where(finished or (is_last and frozen == 0), 0, 1)
+    hits = detection[Detection.HITS]
+    inverting = results[Result.INVERTING]
+    finished = detection[Detection.OPEN] == 0 and detection[Detection.TOO_NEAR] == 0 and inverting == 0
+    finished = finished and (hits == 0 or loop[Loop.NEWLY_FROZEN] == 0)
+    is_last = loop[Loop.ITERATION] > status.max_iterations + status.max_divisions
+    stuck = is_last and loop[Loop.NEWLY_FROZEN] == 0
     results[Result.REMAINING] = hits
-    results[Result.EXCLUDED] = excluded
-    results[Result.BODY_CONTACTS] = of_bodies
-    if counted == 0:
-        results[Result.FILTERED] = filtered
-        results[Result.FIRST_HITS] = first_hits + hits
+    results[Result.EXCLUDED] = detection[Detection.EXCLUDED]
+    results[Result.BODY_CONTACTS] = detection[Detection.OF_BODIES]
+    if results[Result.COUNTED] == 0:
+        results[Result.FILTERED] = _count_filtered(counts, detection[Detection.FILTERED])
+    clear_detection(status)
+    loop[Loop.NEWLY_FROZEN] = 0
+    if results[Result.COUNTED] == 0:
+        results[Result.FIRST_HITS] = results[Result.FIRST_HITS] + hits
         results[Result.COUNTED] = 1
+    are_finite = counts[Counter.NOT_FINITE] == wp.int64(0)
     certify(results, hits == 0 and inverting == 0 and are_finite)
-    loop[Loop.ACTIVE] = more
-    loop[Loop.ITERATION] = iteration + more
-    results[Result.ITERATIONS] = iterations + more
-    loop[Loop.UNFINISHED] = wp.where(more == 1 or constraints > 0, 1, 0)
+    loop[Loop.ACTIVE] = wp.where(finished or stuck, 0, 1)
+    loop[Loop.ITERATION] = loop[Loop.ITERATION] + loop[Loop.ACTIVE]
+    results[Result.ITERATIONS] = results[Result.ITERATIONS] + loop[Loop.ACTIVE]
+    loop[Loop.UNFINISHED] = wp.where(loop[Loop.ACTIVE] == 1 or step.constraints.count[0] > 0, 1, 0)
 
 
 @wp.kernel

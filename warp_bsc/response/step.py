@@ -24,9 +24,7 @@ from .state.workspace import Workspace
 def resolve(work: Workspace, dt: float) -> None:
     """Makes the predicted motion free of its contacts, except for those that cannot be resolved.
 
-    Args:
-        work: The motion, which is only read, and buffers, which hold the result until the next step.
-        dt: Length of the step [s].
+    The motion is only read; buffers hold the result until the next step. ``dt`` is the length of the step [s].
     """
     find_contacts(work)
     resolve_contacts(work, dt)

@@ -64,6 +64,7 @@ def test_distances_that_require_no_gradients_get_none(device):
 
 
 def test_two_states_that_take_turns(device):
+    """Bit for bit on a CPU; on a GPU, contacts come in another order in each run, and sums of gradients round."""
     program = cloth_on_edge(device)
     program.run()  # contacts come in another order in the first run of a solver
     expected = program.gradients()
@@ -71,8 +72,9 @@ def test_two_states_that_take_turns(device):
     take_steps(program, [states[k % 2] for k in range(program.steps + 1)], tape := wp.Tape())
     program.states = [states[program.steps % 2]]
     tape.backward(grads=program.seeds())
+    share = 0.0 if wp.get_device(device).is_cpu else 1e-6
     for name, gradient in zip(STATE, gradients_of(states[0]), strict=True):
-        np.testing.assert_array_equal(gradient, expected[name])
+        np.testing.assert_allclose(gradient, expected[name], rtol=0.0, atol=share * np.abs(expected[name]).max())
 
 
 @wp.kernel

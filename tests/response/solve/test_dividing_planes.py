@@ -13,9 +13,9 @@ from sample_sizes import cases
 
 import warp_bsc as bsc
 from warp_bsc.response.contacts.first_contact import packed_contact
-from warp_bsc.response.contacts.planes_between import add_plane, add_solid, add_to_lists, begin_list, has_planes
+from warp_bsc.response.contacts.planes_between import add_plane, add_solid, has_planes
 from warp_bsc.response.solve.vertex_projection import position_on_sides
-from warp_bsc.response.state.structs import DIVIDED, NEVER, DividingPlanes, Motion, allocate
+from warp_bsc.response.state.structs import DIVIDED, NEVER, NO_NODE, DividingPlanes, Motion, allocate
 
 
 def staged(model, iterations, inner="vbd"):
@@ -184,16 +184,9 @@ def _divide(
 ):
     for i in range(normals.shape[0]):
         add_solid(motion, planes, 0, normals[i], offsets[i], margins[i])
-    begin_list(planes, 0)
-    for plane in range(normals.shape[0]):
-        add_to_lists(motion, planes, plane)
     position, was_cut = position_on_sides(planes, 0, x0, x1)
     end[0] = position
     cut[0] = was_cut
-
-
-def allocate_planes(count, device):
-    return allocate(DividingPlanes, count, device, count=1, rank=4 * count, sides=4 * count, half=0)
 
 
 def divide(planes, x0, x1, device):
@@ -204,7 +197,10 @@ def divide(planes, x0, x1, device):
     inputs = [motion, wp.array(normals, dtype=wp.vec3d, device=device)]
     inputs += [wp.array(offsets, dtype=wp.float64, device=device), wp.array(margins, dtype=float, device=device)]
     end, cut = wp.empty(1, dtype=wp.vec3, device=device), wp.empty(1, dtype=bool, device=device)
-    outputs = [allocate_planes(len(planes), device), end, cut]
+    sizes = {"count": 1, "next": 4 * len(planes), "half": 0}
+    lists = allocate(DividingPlanes, len(planes), device, **sizes)
+    lists.first.fill_(int(NO_NODE))
+    outputs = [lists, end, cut]
     wp.launch(_divide, 1, inputs=[*inputs, wp.vec3(*x0), wp.vec3(*x1)], outputs=outputs, device=device)
     return end.numpy()[0], bool(cut.numpy()[0])
 
@@ -213,10 +209,6 @@ def divide(planes, x0, x1, device):
 def _add_planes(motion: Motion, count: int, planes: DividingPlanes, found: wp.array[bool]):
     for _plane in range(count):
         add_plane(motion, planes, wp.vec4i(0, -1, -1, -1), 1, wp.vec3d(), wp.float64(0.0), wp.float64(0.0))
-    begin_list(planes, 0)
-    for plane in range(planes.place.shape[0]):
-        if plane < count:
-            add_to_lists(motion, planes, plane)
     has_any, complete = has_planes(planes, 0)
     found[0] = has_any
     found[1] = complete
@@ -227,12 +219,15 @@ def test_planes_that_do_not_fit_take_none_away(count, device):
     """A vertex keeps those that it has, and its planes count as incomplete."""
     motion = Motion()
     motion.inverse_mass = wp.ones(1, dtype=float, device=device)
-    lists = allocate_planes(2, device)
+    lists = allocate(DividingPlanes, 2, device, count=1, next=8, half=0)
+    lists.first.fill_(int(NO_NODE))
     found = wp.empty(2, dtype=bool, device=device)
     wp.launch(_add_planes, 1, inputs=[motion, count, lists, found], device=device)
     assert found.numpy().tolist() == [count > 0, count == 2]
-    kept = lists.sides.numpy()[: lists.number.numpy()[0]]
-    assert sorted(kept.tolist()) == [0, 2][:count] and lists.listed.numpy()[0] == len(kept)
+    kept, node = 0, int(lists.first.numpy()[0])
+    while node != NO_NODE:
+        kept, node = kept + 1, int(lists.next.numpy()[node // 2])
+    assert kept == min(count, 2)
 
 
 def unit(*vector):

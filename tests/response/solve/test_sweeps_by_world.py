@@ -9,7 +9,7 @@ from newton_scenes import DT, Changed, bullet
 
 import warp_bsc as bsc
 from warp_bsc.response.state import workspace
-from warp_bsc.response.state.team import threads_of_world
+from warp_bsc.response.state.cluster import threads_of_world
 
 SPEEDS = 2.0, 60.0, 9.0, 30.0
 
@@ -56,11 +56,6 @@ def test_worlds_swept_apart_are_solved_as_by_a_launch_for_each_sweep_and_alone(o
     alone = [run([speed], device, options)[0] for speed in SPEEDS]
     np.testing.assert_array_equal(together, np.concatenate(alone))
     monkeypatch.setattr(workspace, "threads_of_world", lambda *_: 0)
-    if wp.get_device(device).is_cpu:
-        monkeypatch.setattr(workspace, "threads_of_large_team", lambda *_: 1)
-    in_batches, _hits = run(SPEEDS, device, options)
-    np.testing.assert_array_equal(together, in_batches)
-    monkeypatch.setattr(workspace, "threads_of_large_team", lambda *_: 0)
     launched, _hits = run(SPEEDS, device, options)
     np.testing.assert_array_equal(together, launched)
 

@@ -33,19 +33,12 @@ class Containment:
 
 
 class _Sides(NamedTuple):
-    """The sides of bodies on which queries are; a query is a point that is compared with parts of one body.
+    """The sides of bodies on which queries are; a query is a point that is compared with parts of one body."""
 
-    Attributes:
-        on_surface: Whether the point is on one of the parts, where that is looked for, shape [n].
-        inside: Whether the parts wind around the point, if it is not on one of them, shape [n].
-        rows: Query of each face that a ray along +x from the point passes, shape [m].
-        faces: These faces, shape [m].
-    """
-
-    on_surface: np.ndarray
-    inside: np.ndarray
-    rows: np.ndarray
-    faces: np.ndarray
+    on_surface: np.ndarray  # whether the point is on one of the parts, where that is looked for, shape [n]
+    inside: np.ndarray  # whether the parts wind around the point, if it is not on one of them, shape [n]
+    rows: np.ndarray  # query of each face that a ray along +x from the point passes, shape [m]
+    faces: np.ndarray  # these faces, shape [m]
 
 
 class ContainmentFinder:

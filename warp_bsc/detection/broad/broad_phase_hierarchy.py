@@ -21,7 +21,6 @@ CLUSTERS_OF_PART = 2**15
 """Clusters that are traversed at once: a million faces, whose pairs then leave the queue before those of others."""
 _TRAVERSAL_BLOCK = 128
 """Threads of a block of a traversal."""
-
 _LaunchOverFaces = tuple[Callable[[bool, bool], wp.Kernel], Sequence[Any]]
 """A function that makes a kernel, and its inputs, see :meth:`BroadPhaseHierarchy.pair_faces`."""
 
@@ -119,13 +118,7 @@ class BroadPhaseHierarchy:
         self.hierarchy.filtered_of_worlds = counts
 
     def pair_elements(
-        self,
-        x0: wp.array,
-        x1: wp.array,
-        *out: wp.array,
-        changed: wp.array | None = None,
-        keep_separated: bool = False,
-        again: bool = False,
+        self, x0: wp.array, x1: wp.array, *out: wp.array, changed: wp.array | None = None, keep_separated: bool = False
     ) -> None:
         """Enqueues the candidates.
 
@@ -138,14 +131,23 @@ class BroadPhaseHierarchy:
             changed: Nonzero for each vertex whose pairs are sought, array of int; None for all. More than 1, by body,
                 for those of rigid bodies, within which none are. What is not sought may be found as well.
             keep_separated: Whether to enqueue the pairs that an axis separates, too.
-            again: Whether the pairs of faces of the run before, which kept those too, have all that is sought, as each
-                position is between its two of that run; only a large mesh then is traversed again.
         """
-        queues = [_queue_of(*queue) for queue in zip(out[::2], out[1::2], strict=True)]
-        launches: list[_LaunchOverFaces] = [(pair_elements_kernel, queues[:2])]
-        if self._has_points and queues[2:]:
-            launches.append((pair_points_kernel, queues[2:]))
-        self.pair_faces(x0, x1, changed, keep_separated, *launches, again=again)
+        launches = [(pair_elements_kernel, _queues_of(*out[:4]))]
+        if self._has_points and out[4:]:
+            launches.append((pair_points_kernel, _queues_of(*out[4:])))
+        self.pair_faces(x0, x1, changed, keep_separated, *launches)
+
+    def pair_elements_again(self, x0: wp.array, x1: wp.array, *out: wp.array) -> None:
+        """Enqueues as with ``keep_separated``, after a run with it whose paths have those of all vertices in them.
+
+        The pairs of faces of that run have all that is sought; only a large mesh is traversed again.
+        """
+        if len(self._part_counts) > 1:
+            self.pair_elements(x0, x1, *out, keep_separated=True)
+            return
+        self._fit_faces(x0, x1, None, rows_only=True)
+        pairs = _queues_of(self._count, self.face_pairs)
+        self._launch_over_faces(pairs, True, (pair_elements_kernel, _queues_of(*out[:4])))
 
     def pair_edges_with_faces(self, x: wp.array, counts: wp.array, pairs: wp.array, *, is_end: bool = False) -> None:
         """Enqueues the pairs (edge, face) of one configuration that share no vertex and whose boxes overlap.
@@ -157,34 +159,26 @@ class BroadPhaseHierarchy:
             is_end: Whether the positions are those at the end of the motion in the last :meth:`pair_elements`, whose
                 boxes are reused on a CPU.
         """
-        self.pair_faces(x, x, None, False, (pair_edges_with_faces_kernel, [_queue_of(counts, pairs)]))
+        self.pair_faces(x, x, None, False, (pair_edges_with_faces_kernel, _queues_of(counts, pairs)))
 
-    def fit(
-        self,
-        x0: wp.array,
-        x1: wp.array,
-        changed: wp.array | None = None,
-        *,
-        keep_separated: bool = False,
-        only_rows: bool = False,
-    ) -> None:
-        """Writes the corners and the boxes of all faces, and boxes all nodes; arguments as of :meth:`pair_elements`.
+    def fit(self, x0: wp.array, x1: wp.array, changed: wp.array | None = None, *, keep_separated: bool = False) -> None:
+        """Writes the corners and the boxes of all faces, and boxes all nodes; arguments as of :meth:`pair_elements`."""
+        tree, options = self.hierarchy, {"device": self._device, "record_tape": False}
+        tree.swept = keep_separated
+        self._fit_faces(x0, x1, changed)
+        for children, parents in ((tree.clusters, tree.bundles), (tree.bundles, tree.groups)):
+            if parents.boxes is not None:
+                launch(box_parents, WIDTH * len(parents.boxes), inputs=[children, parents], **options)
 
-        With ``only_rows``, boxes of nodes stay as they are, and without a padding those of faces.
-        """
+    def _fit_faces(self, x0, x1, changed, *, rows_only=False):
+        """Writes the corners and the boxes of faces; with ``rows_only`` no boxes, which without a padding are apart."""
         tree, options = self.hierarchy, {"device": self._device, "record_tape": False}
         if not self.is_padded or self._not_finite is not None:
             inputs, outputs = [x0, x1, self._checked], [None if self.is_padded else tree.corners, self._not_finite]
             launch(round_kernel(x0.dtype), self._vertex_count, inputs=inputs, outputs=outputs, **options)
-        tree.swept = keep_separated
-        inputs = [x0, x1, changed, self._padding, tree]
-        if self.is_padded or not only_rows:
+        if self.is_padded or not rows_only:
+            inputs = [x0, x1, changed, self._padding, tree]
             launch(fit_kernel(x0.dtype, self.is_padded), len(tree.order), inputs=inputs, **options)
-        if only_rows:
-            return
-        for children, parents in ((tree.clusters, tree.bundles), (tree.bundles, tree.groups)):
-            if parents.boxes is not None:
-                launch(box_parents, WIDTH * len(parents.boxes), inputs=[children, parents], **options)
 
     def traverse(self, kernel: wp.Kernel, arguments: Any, first: int = 0, end: int | None = None) -> None:
         """Launches a kernel of :func:`traversal_kernel` over the hierarchy, whose boxes were fitted, on no tape.
@@ -206,35 +200,39 @@ class BroadPhaseHierarchy:
         changed: wp.array | None = None,
         keep_separated: bool = False,
         *launches: _LaunchOverFaces,
-        again: bool = False,
     ) -> None:
         """Enqueues the pairs of faces that no axis separates and few others, or all whose swept boxes overlap.
 
         Those of each part of a large mesh take the place of those of the part before, once kernels have gone over them:
         functions that make a kernel for boxes with a padding or without, swept or not, and its inputs, which follow the
-        hierarchy and the queue; its last one is its threads.
+        hierarchy and the queue; the last one is its threads.
         """
+        self.fit(x0, x1, changed, keep_separated=keep_separated)
         parts = len(self._part_counts)
-        traverses = parts > 1 or not again
-        self.fit(x0, x1, changed, keep_separated=keep_separated, only_rows=not traverses)
         if parts > 1:
             self._part_counts.zero_()
-        options = {"device": self._device, "record_tape": False}
-        threads = WIDTH if self._device.is_cpu else THREADS_OF_MULTIPROCESSOR * self._device.sm_count
         for part in range(parts):
             count = self._part_counts[part : part + 1] if parts > 1 else self._count
             ends = [self._clusters * i // parts for i in (part, part + 1)]
-            pairs = _queue_of(count, self.face_pairs)
-            if traverses:
-                self.traverse(traversal_kernel(_enqueue_faces, Pairs, self.is_padded), pairs, *ends)
-            for make_kernel, inputs in launches:
-                kernel = make_kernel(self.is_padded, keep_separated)
-                launch(kernel, threads, inputs=[self.hierarchy, pairs, *inputs, threads], **options)
+            pairs = _queues_of(count, self.face_pairs)
+            self.traverse(traversal_kernel(_enqueue_faces, Pairs, self.is_padded), *pairs, *ends)
+            self._launch_over_faces(pairs, keep_separated, *launches)
         if parts > 1:
+            options = {"device": self._device, "record_tape": False}
             launch(_keep_largest, 1, inputs=[self._part_counts], outputs=[self._count], **options)
 
+    def _launch_over_faces(self, pairs, swept, *launches):
+        threads = WIDTH if self._device.is_cpu else THREADS_OF_MULTIPROCESSOR * self._device.sm_count
+        for make_kernel, others in launches:
+            inputs = [self.hierarchy, *pairs, *others, threads]
+            launch(make_kernel(self.is_padded, swept), threads, inputs=inputs, device=self._device, record_tape=False)
 
-def _queue_of(counts, pairs):
-    queue = Pairs()
-    queue.counts, queue.pairs = counts, pairs
-    return queue
+
+def _queues_of(*arrays):
+    """Returns queues, each of its counts and its pairs."""
+    queues = []
+    for counts, pairs in zip(arrays[::2], arrays[1::2], strict=True):
+        queue = Pairs()
+        queue.counts, queue.pairs = counts, pairs
+        queues.append(queue)
+    return queues

@@ -67,16 +67,9 @@ class BroadPhaseSimd:
         self._filtered_of_worlds = counts
 
     def pair_elements(
-        self,
-        x0: wp.array,
-        x1: wp.array,
-        *out: wp.array,
-        changed: wp.array | None = None,
-        keep_separated: bool = False,
-        again: bool = False,
+        self, x0: wp.array, x1: wp.array, *out: wp.array, changed: wp.array | None = None, keep_separated: bool = False
     ) -> None:
-        """Enqueues the candidates, which are not kept for a run ``again``."""
-        del again
+        """Enqueues the candidates."""
         trees = [self._vertices, self._edges, self._faces]
         if self._edges_of_faces:
             trees.append(self._edges_of_faces)
@@ -95,6 +88,10 @@ class BroadPhaseSimd:
             inputs, outputs = [x0, x1, self._checked], [None, self._not_finite]
             options = {"device": x0.device, "record_tape": False}
             launch(round_kernel(x0.dtype), self._vertex_count, inputs=inputs, outputs=outputs, **options)
+
+    def pair_elements_again(self, x0: wp.array, x1: wp.array, *out: wp.array) -> None:
+        """Enqueues as with ``keep_separated``."""
+        self.pair_elements(x0, x1, *out, keep_separated=True)
 
     def pair_vertices_with_faces(self, counts: wp.array, pairs: wp.array) -> None:
         """Enqueues the (vertex, face) whose boxes in the last run overlap, with arguments as of the others."""

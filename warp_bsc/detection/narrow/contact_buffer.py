@@ -89,15 +89,10 @@ def contacts_from_host(contacts: HostContacts, device: wp.Device) -> ContactBuff
 
 @dataclass(frozen=True, eq=False)
 class ContactRows:
-    """The first rows of a buffer: the contacts of one kind of pair in a result.
+    """The first rows of a buffer: the contacts of one kind of pair in a result."""
 
-    Attributes:
-        buffer: The buffer.
-        count: Number of rows.
-    """
-
-    buffer: ContactBuffer
-    count: int
+    buffer: ContactBuffer  # the buffer
+    count: int  # number of rows
 
     def read(self) -> HostContacts:
         """Returns copies of the contacts; synchronizes with the device."""

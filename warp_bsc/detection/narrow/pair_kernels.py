@@ -129,29 +129,22 @@ class PairRule(NamedTuple):
 
     All take the options of the rule, the kind of pair and its vertices; all but the first also the positions at the
     start and at the end of the step, arrays of vec3 or vec3d.
-
-    Attributes:
-        options: The struct of the options.
-        excludes: Returns whether a pair of the queue is left out.
-        clears: Returns whether a pair is certainly free, so that it is no survivor.
-        decide: Returns the :class:`.Impact` of a survivor, and whether it is a contact; None where the rule has other
-            kernels for survivors.
-        add: Adds a contact with its impact: :func:`add_contact`, or :func:`add_open_contact` where another kernel finds
-            all but its status.
-        turning: Whether the pairs of the rule are those with a turning vertex, by its ``options.arcs``, or those
-            without; None if ``excludes`` says so, and all survivors are of this rule.
-        culls_by_kind: Whether each kind of pair has a kernel of its own to cull.
-        max_registers: Largest number of registers of a thread that decides; 0 for the compiler's choice.
     """
 
-    options: type
-    excludes: wp.Function
-    clears: wp.Function
+    options: type  # the struct of the options
+    excludes: wp.Function  # returns whether a pair of the queue is left out
+    clears: wp.Function  # returns whether a pair is certainly free, so that it is no survivor
+    # returns the :class:`.Impact` of a survivor, and whether it is a contact; None where the rule has other kernels for
+    # survivors
     decide: wp.Function | None = None
+    # adds a contact with its impact: :func:`add_contact`, or :func:`add_open_contact` where another kernel finds all
+    # but its status
     add: wp.Function = add_contact
+    # whether the pairs of the rule are those with a turning vertex, by its ``options.arcs``, or those without; None if
+    # ``excludes`` says so, and all survivors are of this rule
     turning: bool | None = None
-    culls_by_kind: bool = False
-    max_registers: int = 0
+    culls_by_kind: bool = False  # whether each kind of pair has a kernel of its own to cull
+    max_registers: int = 0  # largest number of registers of a thread that decides; 0 for the compiler's choice
 
 
 @made_once

@@ -84,40 +84,27 @@ def capacity_for(count: int, buffer: str) -> int:
 
 
 class Count(enum.IntEnum):
-    """Indices of the counts of one kind of pair in an array, in the order of the phases.
+    """Indices of the counts of one kind of pair in an array, in the order of the phases."""
 
-    Attributes:
-        QUEUED: Pairs enqueued for the narrow phase, the candidates: they share no vertex, their swept boxes overlap,
-            and no coordinate axis separates them at the start and at the end, on the same side.
-        SURVIVORS: Queued pairs that no cull decides.
-        CONTACTS: Survivors that classification, or advancement with a minimum distance, does not certify free.
-        FOUND: Contacts that are not certified free when their time of impact is sought either.
-        UNSURE: Found pairs that are not certified hits either.
-        FOR_EXACT: Found pairs that the exact phase decides, or whose times it finds.
-        TOO_WIDE_1: Pairs of the exact phase whose exponents are too far apart for one limb.
-        TOO_WIDE_2: Pairs of the exact phase whose exponents are too far apart for two limbs.
-        TOO_WIDE_4: Pairs of the exact phase whose exponents are too far apart for four limbs, on a CPU.
-        TOO_WIDE_8: Pairs of the exact phase whose exponents are too far apart for eight limbs or, with a minimum
-            distance, that it does not decide: delegated to the host.
-        REFUTED: Found pairs that the exact phase decides to be free.
-        SUBDIVIDED: Contacts with a minimum distance that advancement leaves to subdivision; of many others on a GPU,
-            those that a simple search does.
-        FILTERED: Pairs that would be candidates, but are left out by groups and masks.
-    """
-
+    # pairs enqueued for the narrow phase, the candidates: they share no vertex, their swept boxes overlap, and no
+    # coordinate axis separates them at the start and at the end, on the same side
     QUEUED = 0
-    SURVIVORS = 1
-    CONTACTS = 2
-    FOUND = 3
-    UNSURE = 4
-    FOR_EXACT = 5
-    TOO_WIDE_1 = 6
-    TOO_WIDE_2 = 7
-    TOO_WIDE_4 = 8
+    SURVIVORS = 1  # queued pairs that no cull decides
+    CONTACTS = 2  # survivors that classification, or advancement with a minimum distance, does not certify free
+    FOUND = 3  # contacts that are not certified free when their time of impact is sought either
+    UNSURE = 4  # found pairs that are not certified hits either
+    FOR_EXACT = 5  # found pairs that the exact phase decides, or whose times it finds
+    TOO_WIDE_1 = 6  # pairs of the exact phase whose exponents are too far apart for one limb
+    TOO_WIDE_2 = 7  # pairs of the exact phase whose exponents are too far apart for two limbs
+    TOO_WIDE_4 = 8  # pairs of the exact phase whose exponents are too far apart for four limbs, on a CPU
+    # pairs of the exact phase whose exponents are too far apart for eight limbs or, with a minimum distance, that it
+    # does not decide: delegated to the host
     TOO_WIDE_8 = 9
-    REFUTED = 10
+    REFUTED = 10  # found pairs that the exact phase decides to be free
+    # contacts with a minimum distance that advancement leaves to subdivision; of many others on a GPU, those that a
+    # simple search does
     SUBDIVIDED = 11
-    FILTERED = 12
+    FILTERED = 12  # pairs that would be candidates, but are left out by groups and masks
 
 
 class PairCounts(NamedTuple):
@@ -168,23 +155,14 @@ FILTERED_COUNTS = range(Counter.PAIRS + Count.FILTERED, Counter.PAIRS + len(Pair
 
 @dataclass(frozen=True)
 class Counts:
-    """Counts of a detection, or the capacities for them, on the host.
+    """Counts of a detection, or the capacities for them, on the host."""
 
-    Attributes:
-        not_finite: Vertices with a position that is not finite; there is no capacity for these.
-        face_pairs: Pairs of faces whose swept boxes overlap, of a broad phase that has a queue for them.
-        vertex_face: Counts of vertex-face pairs.
-        edge_edge: Counts of edge-edge pairs.
-        vertex_edge: Counts of pairs of a point and an edge that no face has.
-        vertex_vertex: Counts of pairs of points.
-    """
-
-    not_finite: int
-    face_pairs: int
-    vertex_face: PairCounts
-    edge_edge: PairCounts
-    vertex_edge: PairCounts = _NO_PAIRS
-    vertex_vertex: PairCounts = _NO_PAIRS
+    not_finite: int  # vertices with a position that is not finite; there is no capacity for these
+    face_pairs: int  # pairs of faces whose swept boxes overlap, of a broad phase that has a queue for them
+    vertex_face: PairCounts  # counts of vertex-face pairs
+    edge_edge: PairCounts  # counts of edge-edge pairs
+    vertex_edge: PairCounts = _NO_PAIRS  # counts of pairs of a point and an edge that no face has
+    vertex_vertex: PairCounts = _NO_PAIRS  # counts of pairs of points
 
     @property
     def pairs(self) -> dict[PairKind, PairCounts]:

@@ -11,11 +11,10 @@ written in the phase, as some threads may still be reading it.
 import warp as wp
 
 from ...kernels.pipeline.queues import take_slot_int, take_slot_of
-from ...response.state.team import wait_for_team
 from . import assembly, bounds, contact_lists, decisions, held, merit, near, steps
 from .flow import Flow, Phase, Place, Problem
 from .system import end_of_contacts
-from .team import count_block, on_gpu
+from .team import count_block, on_gpu, wait_for_team
 
 wp.set_module_options({"enable_backward": False})
 

@@ -3,7 +3,6 @@
 import warp as wp
 
 from ...kernels.not_inlined import NOT_INLINED
-from ...response.state.extremes import raise_to
 from ...response.state.structs import Motion
 from ...response.state.vectors import to_double, to_single
 from ..elasticity.derivatives import find_derivatives
@@ -18,7 +17,7 @@ from .merit import add_energy, add_inertia
 from .pairs import Trial, listed_count
 from .rows import sum_of_blocks, sum_of_corners
 from .steps import way_of
-from .system import Unknowns, block_sum_of_parts, contact_block, contact_gradient, is_solved, sum_of_parts
+from .system import Unknowns, block_sum_of_parts, contact_block, contact_gradient, is_solved, raise_to, sum_of_parts
 
 wp.set_module_options({"enable_backward": False})
 

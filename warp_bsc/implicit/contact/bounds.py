@@ -3,7 +3,6 @@
 import warp as wp
 
 from ...response.contacts.rules import inverse_mass_of
-from ...response.state.extremes import lower_to
 from ...response.state.planes import signed_distance
 from ...response.state.vectors import ZERO, corners_of, to_double, to_single
 from ..vector_access import integers_at
@@ -34,7 +33,7 @@ from .pairs import (
     plane_at,
     stays_far,
 )
-from .system import Progress, kind_of_key
+from .system import Progress, kind_of_key, lower_to
 
 wp.set_module_options({"enable_backward": False})
 

@@ -2,18 +2,17 @@
 
 import warp as wp
 
-from ...response.state.extremes import lower_to, raise_to
 from ...response.state.motion import StateArrays, predicted_velocity
 from ...response.state.poses import turned_pose
 from ...response.state.structs import Motion, Vertices
-from ...response.state.team import wait_for_team
 from ...response.state.vectors import ONE, ZERO, to_double, to_single
 from .bodies import SolvedBodies, arm_on_body, bend_of, body_vertex, exact_on_body, move_body
 from .decisions import may_cut, takes
 from .flow import Phase, Place, Problem, end_of_vertices, go_on, go_on_with_pairs, has_few
 from .merit import add_energy
 from .pairs import Trial, clear_list, moved
-from .system import NOT_UNKNOWN, Progress, Unknowns, displacement, is_solved, unknown_of_corner
+from .system import NOT_UNKNOWN, Progress, Unknowns, displacement, is_solved, lower_to, raise_to, unknown_of_corner
+from .team import wait_for_team
 
 wp.set_module_options({"enable_backward": False})
 

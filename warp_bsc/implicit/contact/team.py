@@ -17,6 +17,29 @@ def on_gpu() -> int:
 @wp.func_native(
     snippet="""
 #if defined(__CUDA_ARCH__)
+    __syncthreads();
+    if (blocks > 1) {
+        if (threadIdx.x == 0) {
+            __threadfence();
+            unsigned* count = (unsigned*)arrived.data + world;
+            const unsigned before = atomicAdd(count, 1u);
+            const unsigned all = (before / blocks + 1u) * blocks;
+            while ((int)(*(volatile unsigned*)count - all) < 0) {}
+            __threadfence();
+        }
+        __syncthreads();
+    }
+#endif
+"""
+)
+def wait_for_team(arrived: wp.array[int], world: int, blocks: int):
+    """Waits until all threads of a world are here, and sees what they have written; its blocks must all be running."""
+    ...
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
     __shared__ int number;
     __syncthreads();
     if (threadIdx.x == 0) {

@@ -11,7 +11,7 @@ from enum import IntEnum
 import numpy as np
 import warp as wp
 
-from ...response.state.team import wait_for_team
+from ..contact.team import wait_for_team
 from .matrix_kernels import Matrix, row_product
 
 wp.set_module_options({"enable_backward": False})

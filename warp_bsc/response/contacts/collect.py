@@ -315,7 +315,9 @@ def collect_contacts(
 
 
 @wp.kernel
-def drop_if_full(step: Step, needed: int):
-    """Drops all constraints if fewer than ``needed`` more fit, which a detection might add."""
-    if step.constraints.count[0] > step.constraints.vertices.shape[0] - needed:
+def clear_changed(step: Step, needed: int):
+    """Clears which vertices changed; drops all constraints if fewer than ``needed`` fit, which a detection may add."""
+    vertex = wp.tid()
+    step.vertices.changed[vertex] = 0
+    if vertex == 0 and step.constraints.count[0] > step.constraints.vertices.shape[0] - needed:
         step.constraints.count[0] = 0

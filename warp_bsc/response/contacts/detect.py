@@ -8,7 +8,7 @@ from ..schedule import decide, decide_worlds
 from ..state.certificate import revoke_if_not_finite
 from ..state.status import Loop, Result, SolveStatus
 from ..state.workspace import Workspace
-from .collect import collect_contacts, collect_penetrations, count_crossings, count_new_crossings, drop_if_full
+from .collect import clear_changed, collect_contacts, collect_penetrations, count_crossings, count_new_crossings
 from .queue import queues_of
 from .search import find_contacts_without_queues
 
@@ -80,9 +80,10 @@ def detect(work: Workspace, *, only_changed: bool = False, keeps_constraints: bo
     retry_until_fits(find, detector, work.device)
     work.reserve(work.max_contacts)
     if only_changed:  # before, nothing has changed, and there is always enough
-        vertices.changed.zero_()
-        if not keeps_constraints:
-            work.launch(drop_if_full, 1, [work.step, work.max_contacts])
+        if keeps_constraints:
+            vertices.changed.zero_()
+        else:
+            work.launch(clear_changed, len(vertices.changed), [work.step, work.max_contacts])
     queues = queues_of(detector)
     overflow = [detector.counters.array, detector.capacities]
     for pair in (queues[:2], queues[2:]) if queues[2:] else (queues[:2],):

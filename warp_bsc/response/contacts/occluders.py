@@ -5,7 +5,7 @@ import warp as wp
 from ...detection.broad.element_pairs import Pairs, filtered_pairs, pair_functions
 from ...detection.broad.face_hierarchy import FaceHierarchy
 from ...detection.run.launch import made_once
-from ...detection.run.settings import NO_GRADIENTS, Counter
+from ...detection.run.settings import NO_GRADIENTS
 from ...kernels.closest import weights_across
 from ...kernels.pipeline.hierarchy import lowest_set_bit
 from ...kernels.pipeline.queues import filled_entries
@@ -60,14 +60,20 @@ def find_nearest_in_queue(step: Step, vertex_face: PairQueue, nearest: wp.array2
 
 @made_once
 def nearest_among_faces_kernel(padded: bool, swept: bool) -> wp.Kernel:
-    """Returns the kernel that keeps the nearest face of each vertex among pairs of faces, as a GPU has in a queue."""
+    """Returns the kernel that keeps the nearest face of each vertex among pairs of faces, as a GPU has in a queue.
+
+    It keeps none where some did not fit: which did depends on the order of threads.
+    """
     vertex_face_pairs = pair_functions(padded, swept).vertex_face_pairs
 
     @wp.kernel(**NO_GRADIENTS)
     def find_nearest_among_faces(
         mesh: FaceHierarchy, face_pairs: Pairs, step: Step, nearest: wp.array2d[float], threads: int
     ):
-        for i in range(wp.tid(), filled_entries(face_pairs.pairs, face_pairs.counts, 0), threads):
+        count = filled_entries(face_pairs.pairs, face_pairs.counts, 0)
+        if face_pairs.counts[0] > wp.int64(count):
+            return
+        for i in range(wp.tid(), count, threads):
             place = face_pairs.pairs[i][0]
             other = face_pairs.pairs[i][1]
             left = vertex_face_pairs(mesh, place, other)
@@ -82,27 +88,12 @@ def nearest_among_faces_kernel(padded: bool, swept: bool) -> wp.Kernel:
 
 
 @wp.kernel
-def clip_paths(
-    # in
-    step: Step,
-    face_pairs: wp.array[wp.int64],
-    capacities: wp.array[wp.int64],
-    # in and out
-    nearest: wp.array2d[float],
-    # in
-    status: SolveStatus,
-    # out
-    ends: wp.array[wp.vec3],
-):
+def clip_paths(step: Step, nearest: wp.array2d[float], status: SolveStatus, ends: wp.array[wp.vec3]):
     """Clips paths where, by :func:`is_behind`, all that is farther is behind the nearest face.
 
-    Where elements cross, nothing is known to be behind another; nor where the queue of pairs of faces was too small:
-    the nearest face of a vertex may be among those that did not fit, and which did depends on the order of threads.
+    Where elements cross, nothing is known to be behind another.
     """
     vertex = wp.tid()
-    if face_pairs[0] > capacities[int(Counter.FACE_PAIRS)]:
-        for direction in range(6):
-            nearest[vertex, direction] = wp.inf
     x0 = step.motion.x0[vertex]
     end = step.vertices.x1[vertex]
     if status.crossings[step.motion.world[vertex]] == 0 and wp.isfinite(end):

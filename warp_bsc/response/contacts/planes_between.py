@@ -3,7 +3,7 @@
 import warp as wp
 
 from ...kernels.pairs import firsts_of
-from ...kernels.pipeline.queues import take_many_slots, take_slot_int
+from ...kernels.pipeline.queues import take_slot_int
 from ..state.structs import DividingPlanes, Motion, Step
 from ..state.vectors import HALF, ZERO, to_double
 from .closest_points import closest_direction
@@ -14,19 +14,9 @@ FAR = wp.constant(wp.float64(1.0e300))
 
 
 @wp.func
-def begin_list(planes: DividingPlanes, vertex: int):
-    """Makes room for the list of a vertex, once all of its planes were added."""
-    planes.begin[vertex] = int(take_many_slots(planes.listed, 0, planes.number[vertex]))
-
-
-@wp.func
-def add_to_lists(motion: Motion, planes: DividingPlanes, plane: int):
-    """Adds a plane to the lists of its vertices, which have begun."""
-    corners = planes.vertices[plane]
-    for j in range(4):
-        if corners[j] >= 0 and inverse_mass_of(motion, corners[j]) > 0.0:
-            place = planes.begin[corners[j]] + planes.rank[4 * plane + j]
-            planes.sides[place] = 2 * plane + wp.where(j < int(planes.split[plane]), 0, 1)
+def _add_node(planes: DividingPlanes, vertex: int, node: int):
+    """Puts a node before the list of a vertex."""
+    planes.next[node / 2] = wp.atomic_exch(planes.first, vertex, node)
 
 
 @wp.func
@@ -39,13 +29,10 @@ def add_plane(
     distance: wp.float64,
     half: wp.float64,
 ) -> int:
-    """Adds a plane with a unit normal to those of up to four vertices, -1 for none, that can be moved.
+    """Adds a plane with a unit normal to the lists of those of up to four vertices, -1 for none, that can be moved.
 
     Vertices before ``split`` stay above the plane, the others below; see :class:`.DividingPlanes`. Where it does not
-    fit, they lack one.
-
-    Returns:
-        The index of the plane, -1 if it does not fit.
+    fit, they lack one. Returns the index of the plane, -1 if it does not fit.
     """
     plane = take_slot_int(planes.count)
     fits = plane < planes.place.shape[0]
@@ -59,7 +46,7 @@ def add_plane(
     for j in range(4):
         if corners[j] >= 0 and inverse_mass_of(motion, corners[j]) > 0.0:
             if fits:
-                planes.rank[4 * plane + j] = wp.atomic_add(planes.number, corners[j], 1)
+                _add_node(planes, corners[j], 8 * plane + 2 * j + wp.where(j < split, 0, 1))
             else:
                 planes.lacks[corners[j]] = 1
     return wp.where(fits, plane, -1)
@@ -80,7 +67,7 @@ def has_planes(planes: DividingPlanes, vertex: int):
 
     Contacts of elements that touch at the start have none, nor do those whose plane did not fit.
     """
-    has_any = planes.number[vertex] > 0
+    has_any = planes.first[vertex] >= 0
     return has_any, has_any and planes.lacks[vertex] == 0
 
 
@@ -108,14 +95,11 @@ def _reach(step: Step, corners: wp.vec4i, begin: int, end: int, origin: wp.vec3d
 def add_dividing_plane(
     step: Step, corners: wp.vec4i, kind: int, min_distance: wp.float64, planes: DividingPlanes, is_contact: bool
 ) -> bool:
-    """Adds a plane between two elements to those of their four vertices that can be moved.
+    """Adds a plane between two elements to the lists of those of their vertices that can be moved; returns whether.
 
     It lies across the shortest vector between them at the start; :mod:`.solve.plane_placement` places it. No plane
     is added between elements that touch at the start, nor between elements that have no contact and that no plane could
     bring together. Half of the distance that the elements must keep, ``min_distance`` [m], is on either side.
-
-    Returns:
-        Whether it added a plane.
     """
     motion = step.motion
     normal = closest_direction(motion, corners, kind)

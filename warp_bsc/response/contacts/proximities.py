@@ -158,11 +158,10 @@ def add_proximities(work: Workspace) -> None:
     wp.copy(work.kept, work.constraints.count)
     nearest.fill_(np.inf)
     _find_nearest(work)
-    counters, capacities = work.detector.counters, work.detector.capacities
-    work.launch(clip_paths, len(ends), [work.step, counters.face_pairs, capacities, nearest, work.status, ends])
     work.launch_over_constraints(disable_contacts_behind, nearest, work.status)
+    work.launch(clip_paths, len(ends), [work.step, nearest, work.status, ends])
     _collect(work, ends)
-    inputs = [work.step, work.kept, work.max_contacts, counters.array, work.detector.capacities]
+    inputs = [work.step, work.kept, work.max_contacts, work.detector.counters.array, work.detector.capacities]
     work.launch(drop_proximities, 1, inputs)
 
 

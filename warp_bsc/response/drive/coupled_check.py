@@ -196,10 +196,7 @@ class CoupledCheck:
     def see(self, given: StateArrays, own: StateArrays, *, begins: bool) -> None:
         """Checks the step that awaits it, given the state of the program; keeps the start of a step that ``begins``.
 
-        Args:
-            given: The state of the program.
-            own: The state at the end of the step, as the stage made it.
-            begins: Whether a step begins.
+        The stage's ``own`` state is that at the end of the step, as the stage made it.
         """
         wp.capture_if(self._step.awaits, self._see, given=given, own=own)
         if begins:

@@ -109,14 +109,9 @@ class Substeps(InnerSteps):
     """
 
     def __init__(self, steps: InnerSteps, motion: ModelMotion, number: int, *, integrator: SolverBase):
-        """Allocates the states between the smaller steps.
+        """Allocates the states between the smaller steps, each of which the inner solver takes as one of ``steps``.
 
-        Args:
-            steps: How the inner solver takes each of the smaller steps.
-            motion: The motion of the steps.
-            number: The number of smaller steps.
-            integrator: The solver that integrates. If it moves no body, a program writes where they are at the end of a
-                step.
+        If the ``integrator`` moves no body, a program writes where they are at the end of a step.
         """
         self.number, self._steps, self._motion, self._model = number, steps, motion, motion.mesh.model
         self.pushes_before = steps.pushes_before

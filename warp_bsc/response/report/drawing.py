@@ -48,14 +48,11 @@ class Drawing:
         vertices: dict[str, np.ndarray],
         impulse_scale: float | None,
     ) -> None:
-        """Draws a step.
+        """Draws a step that ends at positions ``x`` of all vertices of the mesh [m], in a frame of the viewer.
 
-        Args:
-            viewer: The viewer, in a frame.
-            x: Positions of all vertices of the mesh at the end of the step [m], shape [vertex_count, 3].
-            contacts: The contacts, see :meth:`.forces.contact_report.Contacts.numpy`; None if there are none to draw.
-            vertices: Which vertices of the mesh are truncated, frozen and uncertified, bool, shape [vertex_count].
-            impulse_scale: Length of an arrow by its impulse [m/(N s)]; None for two median edges for a large impulse.
+        Contacts are as of :meth:`.forces.contact_report.Contacts.numpy`, None to draw none; vertices by what they are:
+        truncated, frozen or uncertified. The scale of impulses is the length of an arrow by its impulse [m/(N s)]; None
+        for two median edges for a large impulse.
         """
         self._draw_contacts(viewer, contacts, impulse_scale)
         for name, colour in VERTEX_COLOURS.items():

@@ -4,12 +4,30 @@ import newton
 import numpy as np
 import warp as wp
 
-from ..state.extremes import raise_to
 from ..state.structs import Motion
 from ..state.workspace import Workspace
 from ..tuning import COMPRESSION, SOLID
 
 wp.set_module_options({"enable_backward": False})
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
+    const unsigned mask = __activemask();
+    int same;
+    __match_all_sync(mask, world, &same);
+    if (same) {
+        const unsigned most = __reduce_max_sync(mask, __float_as_uint(value));
+        return (threadIdx.x & 31) == __ffs(mask) - 1 ? __uint_as_float(most) : 0.0f;
+    }
+#endif
+    return value;
+"""
+)
+def _largest_of_warp(value: float, world: int) -> float:
+    """Returns the largest value, none negative, of a warp in one world to one of its threads, and 0 to the others."""
+    ...
 
 
 @wp.kernel
@@ -37,8 +55,9 @@ def measure_strain(
     change = wp.max(length - wp.max(start, lengths[i]), COMPRESSION * (wp.min(start, lengths[i]) - length))
     if is_solid[i]:
         change = SOLID * wp.abs(length - start)
-    if change > 0.0:
-        raise_to(strain, motion.world[a], change / lengths[i])
+    largest = _largest_of_warp(wp.max(change, 0.0) / lengths[i], motion.world[a])
+    if largest > 0.0:  # few atomic operations: those on one number wait for each other
+        wp.atomic_max(strain, motion.world[a], largest)
 
 
 class StrainMeter:

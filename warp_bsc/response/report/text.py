@@ -21,11 +21,8 @@ def shape_name(model: newton.Model, shape: int) -> str:
 def table_by_shape(model: newton.Model, contacts: dict[str, np.ndarray], dt: float | None, *, complete: bool) -> str:
     """Returns the contacts of a step by shape: their number, and sums of normal and tangential impulses or forces.
 
-    Args:
-        model: The model.
-        contacts: The contacts, see :meth:`.forces.contact_report.Contacts.numpy`.
-        dt: Length of the step [s], for mean forces [N]; None for impulses [N s].
-        complete: Whether these are all contacts.
+    Contacts are as of :meth:`.forces.contact_report.Contacts.numpy`, ``complete`` if these are all. With the length of
+    the step ``dt`` [s], forces are means [N]; without it, impulses [N s].
     """
     unit, share = ("N s", 1.0) if dt is None else ("N", 1.0 / dt)
     both = contacts["shapes"] + 1  # of two particles: 0

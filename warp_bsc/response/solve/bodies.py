@@ -33,9 +33,8 @@ def _body_of_side(motion: Motion, corners: wp.vec4i, side: int) -> int:
 def _lever(step: Step, i: int, side: int, x: wp.array[wp.vec3]):
     """Returns the lever of the first or second element of a constraint, at positions ``x`` of the vertices.
 
-    Returns:
-        The body, -1 if the side is no body that can be moved; the sum of the weights of its vertices, and the sum of
-        their arms by weight [m].
+    It is the body, -1 if the side is none that can be moved; the sum of the weights of its vertices, and of their arms
+    by weight [m].
     """
     corners = step.constraints.vertices[i]
     weights = step.constraints.weights[i]
@@ -93,9 +92,8 @@ def body_inverse_masses(step: Step, i: int, x: wp.array[wp.vec3], counted: wp.fl
 def body_change(step: Step, i: int, side: int, change: wp.vec3d, x: wp.array[wp.vec3]):
     """Returns what the change of a multiplier does to the body on one side of its constraint.
 
-    Returns:
-        The body, -1 if there is none that can be moved; the change of its centre of mass and its turn, or of the
-        velocities of both.
+    It is the body, -1 if there is none that can be moved; the change of its centre of mass and its turn, or of the
+    velocities of both.
     """
     body, weight, arm = _lever(step, i, side, x)
     shift = wp.vec3d()

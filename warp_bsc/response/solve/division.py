@@ -13,6 +13,7 @@ from ..contacts.constraints import NEVER_VIOLATED, TOUCH, has_pushed, kind_of_pa
 from ..contacts.first_contact import TIME_UNITS
 from ..contacts.planes_between import add_dividing_plane, has_planes
 from ..schedule import divides_now, divides_proximities, is_freezing, note_moved
+from ..state.cluster import BLOCK
 from ..state.poses import pose_between, velocity_between
 from ..state.status import Loop, SolveStatus
 from ..state.structs import (
@@ -146,7 +147,7 @@ def _divided(dividing: DividingPlanes, vertex: int, outcome: int) -> int:
 def _keep_on_sides(step: Step, dividing: DividingPlanes, status: SolveStatus, vertex: int):
     """Moves a vertex without a contact onto its sides, so that it comes into no element while others are divided."""
     vertices = step.vertices
-    if dividing.number[vertex] == 0 or dividing.placed[vertex] == NOT_PLACED:
+    if dividing.first[vertex] < 0 or dividing.placed[vertex] == NOT_PLACED:
         return
     if step.motion.inverse_mass[vertex] == 0.0 or not divides_now(status, step.motion.world[vertex]):
         return
@@ -260,10 +261,11 @@ def take_velocities_of_paths(step: Step, ends: wp.array[wp.vec3], dt: wp.float64
 def divide(work: Workspace, dt: float) -> None:
     """Moves vertices of worlds past their projections onto their sides; else cuts their paths, else freezes them."""
     particles, worlds, changed = work.particle_count, work.worlds, [work.dividing, work.status]
-    size = max(len(work.vertices.x1), worlds)
     work.launch_over_constraints(divide_proximities, *changed)
-    work.launch(begin_passes, size, [work.step, work.dividing, particles, worlds, work.status])
-    work.launch_in_block(pass_over_few_planes, [work.step, work.dividing, work.tolerance, work.status, particles])
+    work.launch(begin_passes, max(particles, worlds), [work.step, work.dividing, particles, worlds, work.status])
+    threads = 1 if work.device.is_cpu else BLOCK
+    inputs = [work.step, work.dividing, work.tolerance, work.status, threads]
+    wp.launch(pass_over_few_planes, threads, inputs=inputs, device=work.device, block_dim=BLOCK)
     wp.capture_while(work.loop[Loop.MORE_PASSES], _pass_over_planes, work=work)
     work.launch_over_particles(truncate_vertices, *changed, dt)
     work.launch_over_shape_vertices(find_body_shares, *changed)

@@ -12,12 +12,12 @@ apart, follow each other in a few passes. Elements that slide along a plane go o
 import warp as wp
 
 from ...kernels.pipeline.queues import take_slot_int
-from ..contacts.planes_between import FAR, add_to_lists, begin_list
+from ..contacts.planes_between import FAR
 from ..contacts.rules import inverse_mass_of
 from ..schedule import divides_after, divides_now
+from ..state.cluster import BLOCK, wait_for_block
 from ..state.status import Loop, SolveStatus
-from ..state.structs import CUT_SHORT, FROZEN, NOT_PLACED, PLACED, DividingPlanes, Step
-from ..state.team import BLOCK, wait_for_block
+from ..state.structs import CUT_SHORT, FROZEN, NO_NODE, NOT_PLACED, PLACED, DividingPlanes, Step
 from ..state.vectors import HALF, ZERO, to_double
 from ..tuning import CLOSE_MARGIN, CLOSE_TOGETHER, FAR_APART, MARGIN, MAX_PASSES, SLACK
 from .vertex_projection import position_on_sides, position_on_way
@@ -37,9 +37,10 @@ def want(planes: DividingPlanes, vertex: int, end: wp.vec3):
 
 @wp.kernel
 def begin_passes(step: Step, planes: DividingPlanes, particles: int, worlds: int, status: SolveStatus):
-    """Lets each particle begin at its start, and want the end that it had when it got its first plane; begins lists."""
+    """Lets each particle begin at its start, and want the end that it had when it got its first plane."""
     i = wp.tid()
     if i == 0:
+        status.loop[Loop.PROJECTING] = 0  # sweeps are over; the next detection says whether there are others
         status.loop[Loop.PASS] = 0
         status.loop[Loop.MORE_PASSES] = wp.where(planes.count[0] > FEW_PLANES, 1, 0)
     if i < worlds:
@@ -48,13 +49,11 @@ def begin_passes(step: Step, planes: DividingPlanes, particles: int, worlds: int
             status.idle[i] = status.idle[i] + 1  # until something moves
         planes.moved[i] = 0
         planes.missed[i] = 0
-    if i < planes.number.shape[0] and planes.number[i] > 0:
-        begin_list(planes, i)
-        planes.listed_vertices[take_slot_int(planes.vertex_count)] = i
-        if i < particles:
-            planes.reached[i] = step.motion.x0[i]
-            if planes.placed[i] == NOT_PLACED:
-                want(planes, i, step.vertices.x1[i])
+    if i < particles and planes.first[i] != NO_NODE:
+        planes.listed[take_slot_int(planes.listed_count)] = i
+        planes.reached[i] = step.motion.x0[i]
+        if planes.placed[i] == NOT_PLACED:
+            want(planes, i, step.vertices.x1[i])
 
 
 @wp.struct
@@ -104,8 +103,6 @@ def _side(
 @wp.func
 def _place_plane(step: Step, planes: DividingPlanes, status: SolveStatus, plane: int):
     loop = status.loop
-    if loop[Loop.PASS] <= 1:  # if read too early, it is listed twice
-        add_to_lists(step.motion, planes, plane)
     if planes.vertices[plane][3] < 0:
         return
     corners = planes.vertices[plane]
@@ -136,14 +133,6 @@ def _place_plane(step: Step, planes: DividingPlanes, status: SolveStatus, plane:
     planes.margin[plane] = float(margin)
 
 
-@wp.func
-def _begin_pass(planes: DividingPlanes, status: SolveStatus):
-    """Counts a pass, which is the last one unless a vertex asks for another; the lists of vertices are complete."""
-    status.loop[Loop.PASS] = status.loop[Loop.PASS] + 1
-    status.loop[Loop.MORE_PASSES] = 0
-    planes.listed[0] = wp.int64(0)
-
-
 @wp.kernel
 def place_planes(step: Step, planes: DividingPlanes, status: SolveStatus, threads: int):
     """Places each plane where both elements would meet by their masses, but between what they have reached.
@@ -151,8 +140,10 @@ def place_planes(step: Step, planes: DividingPlanes, status: SolveStatus, thread
     Nor is it within a vertex that cannot be moved, which may have passed what the other has reached. Elements come no
     nearer to each other than a share of their distance at the start, or of ``FAR_APART`` separations.
     """
+    loop = status.loop
     if wp.tid() == 0:
-        _begin_pass(planes, status)
+        loop[Loop.PASS] = loop[Loop.PASS] + 1
+        loop[Loop.MORE_PASSES] = 0
     for plane in range(wp.tid(), wp.min(planes.count[0], planes.place.shape[0]), threads):
         _place_plane(step, planes, status, plane)
 
@@ -164,7 +155,7 @@ def _move_to_sides(step: Step, planes: DividingPlanes, tolerance: wp.float64, st
     A world needs another pass if one of its particles is not there, and one has moved by more than the tolerance.
     """
     world = step.motion.world[particle]
-    if planes.number[particle] == 0 or not divides_now(status, world):
+    if planes.first[particle] < 0 or not divides_now(status, world):
         return
     if step.motion.inverse_mass[particle] == 0.0 or step.vertices.outcome[particle] & FROZEN != 0:
         return
@@ -197,25 +188,23 @@ def move_to_sides(step: Step, planes: DividingPlanes, tolerance: wp.float64, sta
 
 
 @wp.kernel(module="unique", enable_backward=False, launch_bounds=BLOCK)
-def pass_over_few_planes(
-    step: Step, planes: DividingPlanes, tolerance: wp.float64, status: SolveStatus, particles: int, threads: int
-):
-    """Makes all passes over at most ``FEW_PLANES``, in one block of threads: the launches of more take longer."""
-    thread = wp.tid()
-    count, vertices = int(planes.count[0]), int(planes.vertex_count[0])
-    more = count > 0 and count <= FEW_PLANES
+def pass_over_few_planes(step: Step, planes: DividingPlanes, tolerance: wp.float64, status: SolveStatus, threads: int):
+    """Makes all passes over at most ``FEW_PLANES`` in one block of threads, which takes less time than launches."""
+    thread, particles = wp.tid(), int(planes.listed_count[0])
+    count = wp.min(planes.count[0], planes.place.shape[0])
+    more = count > 0 and planes.count[0] <= FEW_PLANES
     while more:
         wait_for_block()
         if thread == 0:
-            _begin_pass(planes, status)
+            status.loop[Loop.PASS] = status.loop[Loop.PASS] + 1
+            status.loop[Loop.MORE_PASSES] = 0
         wait_for_block()
-        for plane in range(thread, wp.min(count, planes.place.shape[0]), threads):
+        for plane in range(thread, count, threads):
             _place_plane(step, planes, status, plane)
         wait_for_block()
-        for i in range(thread, vertices, threads):
-            if planes.listed_vertices[i] < particles:
-                _move_to_sides(step, planes, tolerance, status, planes.listed_vertices[i])
+        for i in range(thread, particles, threads):
+            _move_to_sides(step, planes, tolerance, status, planes.listed[i])
         wait_for_block()
         more = status.loop[Loop.MORE_PASSES] == 1
     if thread == 0:
-        planes.vertex_count[0] = 0
+        planes.listed_count[0] = 0

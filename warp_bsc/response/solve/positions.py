@@ -7,15 +7,14 @@ import warp as wp
 from ..._profiling import phase
 from ..contacts.constraints import gap, min_distance_of, moves_body
 from ..schedule import divides_after, is_reversible, projects_now
+from ..state.cluster import BLOCK, constraints_of_world, wait_for_others
 from ..state.fixed_sum import with_delta
-from ..state.status import Loop, SolveStatus, start_sweeps
+from ..state.status import Loop, SolveStatus, has_sweeps, start_sweeps
 from ..state.structs import PROJECTED, ContactKind, Incidence, Pace, Step, constraint_at, constraint_count
-from ..state.team import BLOCK, LARGE_BLOCK, Team, in_one_block, large_team, team_of_world, wait_for_others
 from ..state.vectors import ONE, ZERO, relative
 from ..state.workspace import Workspace
 from ..tuning import (
     CLOSE_EDGES,
-    COUNTED,
     MAX_SWEEPS,
     PUSHING_MOMENTUM,
     SWEEPS_PER_BATCH,
@@ -25,8 +24,6 @@ from ..tuning import (
 )
 from . import sweeps
 from .bodies import move_bodies, place_vertices
-from .kept import KeptConstraint, make_sweeps, values_of
-from .kept import project as project_kept
 
 wp.set_module_options({"enable_backward": False})
 
@@ -125,95 +122,9 @@ def update_positions(step: Step, status: SolveStatus, last: bool):
         _update_vertex(step, vertex)
 
 
-@wp.func
-def _keep(step: Step, status: SolveStatus, i: int, is_here: bool) -> KeptConstraint:
-    """Returns a constraint as :func:`make_sweeps` takes it; none of its vertices is of a body."""
-    constraints, kept = step.constraints, KeptConstraint()
-    kept.is_here = is_here
-    kept.corners = constraints.vertices[i]
-    kept.weights = constraints.weights[i]
-    for j in range(4):
-        moves = kept.weights[j] != ZERO and step.motion.inverse_mass[kept.corners[j]] > 0.0
-        kept.moves[j] = wp.where(moves, 1, 0)
-    kept.normal = constraints.normal[i]
-    kept.target = constraints.separation[i]
-    kept.origin = relative(kept.weights, kept.corners, step.motion.x0)
-    kept.pushes_only = not is_reversible(status, constraints.pace[i] != Pace.FAST)
-    counted = wp.where(kept.pushes_only, COUNTED, ONE)
-    kept.inverse_mass = sweeps.inverse_mass_of_vertices(step, i, counted)
-    kept.friction = wp.float64(constraints.friction[i])
-    kept.most = sweeps.max_position_sweeps(step, status, i)
-    kept.multiplier = constraints.position_multiplier[i]
-    kept.previous = constraints.previous_multiplier[i]
-    kept.last = constraints.last_sweep[i]
-    return kept
-
-
-@wp.func
-def _store(step: Step, i: int, kept: KeptConstraint):
-    """Stores what sweeps changed of a constraint."""
-    step.constraints.position_multiplier[i] = kept.multiplier
-    step.constraints.previous_multiplier[i] = kept.previous
-    step.constraints.last_sweep[i] = kept.last
-
-
-@wp.func
-def _sweep_in_memory(step: Step, status: SolveStatus, sweep: int, i: int):
-    """Makes a sweep over one of more constraints than there are threads."""
-    vertices, kept = step.vertices, _keep(step, status, i, True)
-    values = values_of(kept, vertices.x1)
-    _store(step, i, project_kept(kept, values, step.motion.inverse_mass, vertices.particle_delta_x, sweep))
-
-
-@wp.func
-def _sweep_in_registers(step: Step, status: SolveStatus, team: Team, number: int, blocks: int):
-    """Makes a number of sweeps over an active set of which each thread has one constraint at most."""
-    motion, vertices, constraints = step.motion, step.vertices, step.constraints
-    place = team.first + team.thread
-    i = int(constraints.active_set[wp.min(place, team.end - 1)])
-    kept = make_sweeps(
-        _keep(step, status, i, place < team.end),
-        motion.inverse_mass,
-        motion.x1,
-        vertices.x1,
-        vertices.particle_delta_x,
-        status,
-        team,
-        number,
-        blocks,
-    )
-    if kept.is_here:
-        _store(step, i, kept)
-        for j in range(4):
-            vertex = kept.corners[j]
-            vertices.active[vertex] = 0
-            if kept.moves[j] != 0:
-                vertices.changed[vertex] = 1
-                vertices.outcome[vertex] = vertices.outcome[vertex] | PROJECTED
-
-
-@wp.func
-def _make_batch(step: Step, particles: Incidence, status: SolveStatus, team: Team, number: int):
-    """Makes a number of sweeps over an active set, by as few blocks as have a thread for each constraint."""
-    if team.end - team.first > team.threads:
-        for i_of_batch in range(number):
-            for place in range(team.first + team.thread, team.end, team.threads):
-                i = int(step.constraints.active_set[place])
-                _sweep_in_memory(step, status, team.sweep + i_of_batch, i)
-            wait_for_others(status, team.blocks)
-            for k in range(team.first_particle + team.thread, team.end_particle, team.threads):
-                if sweeps.takes_changes(step, i_of_batch == number - 1, particles.items[k]):
-                    _update_vertex(step, particles.items[k])
-            wait_for_others(status, team.blocks)
-    else:
-        blocks = wp.where(team.end - team.first > team.block, team.blocks, 1)
-        if blocks != 1 or team.thread < team.block:
-            _sweep_in_registers(step, status, team, number, blocks)
-
-
 @functools.cache
 def _sweep(cluster: int) -> wp.Kernel:
-    """Returns the kernel that makes sweeps over each world by one cluster of blocks, see :mod:`.state.team`."""
+    """Returns the kernel that makes sweeps over each world by one cluster of blocks, see :mod:`.state.cluster`."""
 
     @wp.kernel(module="unique", enable_backward=False, cluster_dim=cluster, launch_bounds=BLOCK)
     def sweep_positions(
@@ -229,39 +140,34 @@ def _sweep(cluster: int) -> wp.Kernel:
     ):
         """Makes at most so many sweeps, with a new active set after each ``batch`` of them."""
         world = wp.tid() // threads
-        team = team_of_world(step, particles, world, wp.tid() - world * threads, threads)
-        first = team.first
-        end = first + step.constraints.number[world]
-        team = in_one_block(team, end - first)
-        sweeps_now = status.loop[Loop.MORE_SWEEPS] == 1 and end > first and team.thread < team.threads
-        team.sweep = wp.where(sweeps_now, 0, most)
-        while team.sweep < most:
-            if team.thread == 0:
-                step.constraints.active_count[world] = wp.int64(0)
-            wait_for_others(status, team.blocks)
-            for place in range(first + team.thread, end, team.threads):
+        thread = wp.tid() - world * threads
+        constraints = step.constraints
+        first = int(constraints.first[world])
+        end = first + constraints_of_world(step, world)
+        sweep = int(wp.where(has_sweeps(status) and end > first, 0, most))
+        while sweep < most:
+            if thread == 0:
+                constraints.active_count[world] = wp.int64(0)
+            wait_for_others()
+            for place in range(first + thread, end, threads):
                 i = constraint_at(step, place)
-                if _is_active(step, status, team.sweep, tolerance, i):
+                if _is_active(step, status, sweep, tolerance, i):
                     sweeps.activate(step, i, world, first)
-            wait_for_others(status, team.blocks)
-            team.end = first + int(step.constraints.active_count[world])
-            if team.end == first:
+            wait_for_others()
+            active_end = first + int(constraints.active_count[world])
+            if active_end == first:
                 break
-            _make_batch(step, particles, status, team, batch)
-            wait_for_others(status, team.blocks)
-            team.sweep += batch
+            for i_of_batch in range(batch):
+                for place in range(first + thread, active_end, threads):
+                    _project_constraint(step, status, sweep, place)
+                wait_for_others()
+                for k in range(particles.first[world] + thread, particles.first[world + 1], threads):
+                    if sweeps.takes_changes(step, i_of_batch == batch - 1, particles.items[k]):
+                        _update_vertex(step, particles.items[k])
+                wait_for_others()
+                sweep += 1
 
     return sweep_positions
-
-
-@wp.kernel(module="unique", enable_backward=False, launch_bounds=LARGE_BLOCK)
-def sweep_positions_together(step: Step, particles: Incidence, status: SolveStatus, number: int, threads: int):
-    """Makes a number of sweeps over the active set of all worlds, by a :func:`.large_team`."""
-    team = large_team(step, particles, status, wp.tid(), threads)
-    if team.end > 0:
-        _make_batch(step, particles, status, team, number)
-    if team.thread == 0:
-        sweeps.finish_sweeps(step, status, team.sweep + number, team.end, True)
 
 
 @phase("project positions")
@@ -270,7 +176,7 @@ def project(work: Workspace) -> None:
     if work.sweeping_threads:
         work.sweep_by_world(_sweep, [work.status, work.tolerance, int(MAX_SWEEPS), int(SWEEPS_PER_BATCH)])
         return
-    work.repeat_sweeps(lambda: _activate(work), sweep_positions_together, project_positions, _update)
+    work.repeat_sweeps(lambda: _activate(work), project_positions, _update)
 
 
 def leave_planes(work: Workspace) -> None:
@@ -283,7 +189,7 @@ def _leave_planes(work):
         work.sweep_by_world(_sweep, [work.status, work.tolerance, 1, 1])
         return
     work.launch(start_sweeps, 1, [work.status])
-    work.sweep(1, lambda: _activate(work), sweep_positions_together, project_positions, _update)
+    work.sweep(1, lambda: _activate(work), project_positions, _update)
 
 
 def _activate(work):

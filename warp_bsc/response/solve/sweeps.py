@@ -18,8 +18,11 @@ from .bodies import activate_bodies, add_body_delta, body_inverse_masses
 
 
 @wp.func
-def inverse_mass_of_vertices(step: Step, i: int, counted: wp.float64) -> wp.float64:
-    """Returns the part of the inverse masses of a constraint [1/kg] that is of vertices, see the next one."""
+def effective_inverse_masses(step: Step, i: int, x: wp.array[wp.vec3], counted: wp.float64):
+    """Returns the inverse masses of a constraint [1/kg] along its normal and across it, at positions ``x`` of vertices.
+
+    Its vertices and bodies are split among the share ``counted`` of their active constraints.
+    """
     inverse_mass = ZERO
     weights = step.constraints.weights[i]
     for j in range(4):
@@ -27,16 +30,6 @@ def inverse_mass_of_vertices(step: Step, i: int, counted: wp.float64) -> wp.floa
         parts = wp.max(wp.float64(step.vertices.active[vertex]) * counted, ONE)
         share = wp.float64(step.motion.inverse_mass[vertex]) * parts
         inverse_mass += weights[j] * weights[j] * share
-    return inverse_mass
-
-
-@wp.func
-def effective_inverse_masses(step: Step, i: int, x: wp.array[wp.vec3], counted: wp.float64):
-    """Returns the inverse masses of a constraint [1/kg] along its normal and across it, at positions ``x`` of vertices.
-
-    Its vertices and bodies are split among the share ``counted`` of their active constraints.
-    """
-    inverse_mass = inverse_mass_of_vertices(step, i, counted)
     if not step.motion.bodies.of_vertex:
         return inverse_mass, inverse_mass
     along, across = body_inverse_masses(step, i, x, counted)
@@ -246,17 +239,13 @@ def finish_sweep(step: Step, status: SolveStatus, last: bool, vertex: int) -> bo
     The ``last`` sweep over an active set empties it.
     """
     if vertex == 0:
-        finish_sweeps(step, status, status.loop[Loop.SWEEP] + 1, int(step.constraints.active_count[0]), last)
+        sweep = status.loop[Loop.SWEEP] + 1
+        count = int(step.constraints.active_count[0])
+        status.loop[Loop.SWEEP] = sweep
+        status.loop[Loop.MORE_SWEEPS] = wp.where(count > 0 and sweep < MAX_SWEEPS, 1, 0)
+        if last:
+            step.constraints.active_count[0] = wp.int64(0)
     return takes_changes(step, last, vertex)
-
-
-@wp.func
-def finish_sweeps(step: Step, status: SolveStatus, sweep: int, active: int, last: bool):
-    """Sets the number of sweeps so far, over so many active constraints, and decides on another batch."""
-    status.loop[Loop.SWEEP] = sweep
-    status.loop[Loop.MORE_SWEEPS] = wp.where(active > 0 and sweep < MAX_SWEEPS, 1, 0)
-    if last:
-        step.constraints.active_count[0] = wp.int64(0)
 
 
 @wp.func

@@ -1,5 +1,7 @@
 """Projects a vertex onto its sides of dividing planes, which :mod:`.plane_placement` places.
 
+Loops over the list of a vertex read the next node before they use the plane of this one: a GPU waits for both at once.
+
 References:
     D. Goldfarb and A. Idnani, A Numerically Stable Dual Method for Solving Strictly Convex Quadratic Programs,
     Mathematical Programming 27, 1983, doi:10.1007/BF02591962.
@@ -8,13 +10,12 @@ References:
 import warp as wp
 
 from ..contacts.planes_between import FAR
-from ..state.structs import DividingPlanes
+from ..state.structs import NO_NODE, DividingPlanes
 from ..state.vectors import ONE, ZERO, to_double, to_single
 from ..tuning import MAX_PLANE_STEPS, WEDGE
 
 wp.set_module_options({"enable_backward": False})
 
-_Normals = wp.types.matrix(shape=(4, 3), dtype=wp.float64)
 _PARALLEL = wp.constant(wp.float64(1.0e-14))
 """Squared sine up to which a normal counts as one within the span of others."""
 _ROUNDING = wp.constant(wp.float64(1.0e-6))
@@ -23,52 +24,27 @@ _SMALLEST = wp.constant(float(2.0**-149))
 """The smallest number in single precision."""
 
 
-@wp.struct
-class _HalfSpaces:
-    """A vertex's sides of four planes of its list."""
-
-    normals: _Normals
-    least: wp.vec4d  # coordinates along them
-    margins: wp.vec4d
-
-
 @wp.func
-def _half_spaces(planes: DividingPlanes, first: int, end: int) -> _HalfSpaces:
-    """Returns the sides from a place of the lists on, the last one before ``end`` as often as it takes for four."""
-    sides, places, margins, halves = wp.vec4i(), wp.mat44d(), wp.vec4(), wp.vec4d()
-    for j in range(4):  # first what is read, for which a GPU then waits once
-        sides[j] = planes.sides[wp.min(first + j, end - 1)]
-    for j in range(4):
-        places[j] = planes.place[sides[j] / 2]
-        margins[j] = planes.margin[sides[j] / 2]
+def _half_space(planes: DividingPlanes, node: int):
+    """Returns the normal of a vertex's side of a plane, its least coordinate along it, and the margin."""
+    plane = node / 8
+    side = wp.where(node % 2 == 0, ONE, -ONE)
+    place = planes.place[plane]
+    least = side * place[3]
     if planes.half:
-        for j in range(4):
-            halves[j] = planes.half[sides[j] / 2]
-    found = _HalfSpaces()
-    for j in range(4):
-        side = wp.where(sides[j] % 2 == 0, ONE, -ONE)
-        found.normals[j] = side * wp.vec3d(places[j, 0], places[j, 1], places[j, 2])
-        found.least[j] = side * places[j, 3] + halves[j]
-        found.margins[j] = wp.float64(margins[j])
-    return found
-
-
-@wp.func
-def _list_of(planes: DividingPlanes, vertex: int):
-    """Returns where the list of a vertex begins and ends."""
-    begin = int(planes.begin[vertex])
-    return begin, begin + planes.number[vertex]
+        least += planes.half[plane]
+    return side * wp.vec3d(place[0], place[1], place[2]), least, wp.float64(planes.margin[plane])
 
 
 @wp.func
 def _is_above(planes: DividingPlanes, vertex: int, x: wp.vec3d) -> bool:
     """Returns whether a position of a vertex is above all of its planes."""
-    begin, end_of_list = _list_of(planes, vertex)
-    for first in range(begin, end_of_list, 4):
-        some = _half_spaces(planes, first, end_of_list)
-        for j in range(4):
-            if wp.dot(some.normals[j], x) <= some.least[j]:
-                return False
+    node = planes.first[vertex]
+    while node >= 0:
+        normal, least, _margin = _half_space(planes, node)
+        node = planes.next[node / 2]
+        if wp.dot(normal, x) <= least:
+            return False
     return True
 
 
@@ -124,16 +100,16 @@ def _projected(planes: DividingPlanes, vertex: int, x: wp.vec3d) -> wp.vec3d:
         left -= 1
         if not joins:
             most = ZERO
-            begin, end_of_list = _list_of(planes, vertex)
-            for first in range(begin, end_of_list, 4):
-                some = _half_spaces(planes, first, end_of_list)
-                for j in range(4):
-                    missing = some.least[j] + some.margins[j] - wp.dot(some.normals[j], x)
-                    if missing >= some.margins[j] and missing >= most:
-                        if missing > most or _precedes(some.normals[j], normal):
-                            most = missing
-                            normal = some.normals[j]
-                            height = some.least[j] + some.margins[j]
+            node = planes.first[vertex]
+            while node >= 0:
+                other, least, margin = _half_space(planes, node)
+                node = planes.next[node / 2]
+                missing = least + margin - wp.dot(other, x)
+                if missing >= margin and missing >= most:
+                    if missing > most or _precedes(other, normal):
+                        most = missing
+                        normal = other
+                        height = least + margin
             if most == ZERO:
                 return x
             joins = True
@@ -143,7 +119,7 @@ def _projected(planes: DividingPlanes, vertex: int, x: wp.vec3d) -> wp.vec3d:
         length = FAR
         if rise > _PARALLEL:
             length = (height - wp.dot(normal, x)) / rise
-        leaves = int(-1)
+        leaves = int(NO_NODE)
         for j in range(count):
             if parts[j] > ZERO and multipliers[j] < length * parts[j]:
                 length = multipliers[j] / parts[j]
@@ -155,7 +131,7 @@ def _projected(planes: DividingPlanes, vertex: int, x: wp.vec3d) -> wp.vec3d:
         multiplier += length
         if rise > _PARALLEL:
             x += length * across
-        if leaves < 0:
+        if leaves == NO_NODE:
             normals[count] = normal
             multipliers[count] = multiplier
             count += 1
@@ -172,14 +148,14 @@ def _projected(planes: DividingPlanes, vertex: int, x: wp.vec3d) -> wp.vec3d:
 def share_of_path(planes: DividingPlanes, vertex: int, x0: wp.vec3d, x1: wp.vec3d) -> wp.float64:
     """Returns the share of a path, in [0, 1], up to which it is above the planes of its vertex."""
     share = ONE
-    begin, end_of_list = _list_of(planes, vertex)
-    for first in range(begin, end_of_list, 4):
-        some = _half_spaces(planes, first, end_of_list)
-        for j in range(4):
-            before = wp.dot(some.normals[j], x0) - some.least[j]
-            after = wp.dot(some.normals[j], x1) - some.least[j]
-            if after <= ZERO and before > after:
-                share = wp.min(share, wp.max(before - some.margins[j], ZERO) / (before - after))
+    node = planes.first[vertex]
+    while node >= 0:
+        normal, least, margin = _half_space(planes, node)
+        node = planes.next[node / 2]
+        before = wp.dot(normal, x0) - least
+        after = wp.dot(normal, x1) - least
+        if after <= ZERO and before > after:
+            share = wp.min(share, wp.max(before - margin, ZERO) / (before - after))
     return share
 
 
@@ -201,14 +177,14 @@ def _rounded(planes: DividingPlanes, vertex: int, x: wp.vec3d) -> wp.vec3:
     end = to_single(x)
     most = -FAR
     normal = wp.vec3d()
-    begin, end_of_list = _list_of(planes, vertex)
-    for first in range(begin, end_of_list, 4):
-        some = _half_spaces(planes, first, end_of_list)
-        for j in range(4):
-            missing = some.least[j] - wp.dot(some.normals[j], to_double(end))
-            if missing > most or (missing == most and _precedes(some.normals[j], normal)):
-                most = missing
-                normal = some.normals[j]
+    node = planes.first[vertex]
+    while node >= 0:
+        other, least, _margin = _half_space(planes, node)
+        node = planes.next[node / 2]
+        missing = least - wp.dot(other, to_double(end))
+        if missing > most or (missing == most and _precedes(other, normal)):
+            most = missing
+            normal = other
     for axis in range(3):
         end[axis] = _towards(end[axis], x[axis], normal[axis])
     return end
@@ -223,11 +199,11 @@ def _most_correction(planes: DividingPlanes, vertex: int, start: wp.vec3d, end: 
     more, as planes that are nearly parallel meet far away.
     """
     below = ZERO
-    begin, end_of_list = _list_of(planes, vertex)
-    for first in range(begin, end_of_list, 4):
-        some = _half_spaces(planes, first, end_of_list)
-        for j in range(4):
-            below = wp.max(below, some.least[j] + some.margins[j] - wp.dot(some.normals[j], start))
+    node = planes.first[vertex]
+    while node >= 0:
+        normal, least, margin = _half_space(planes, node)
+        node = planes.next[node / 2]
+        below = wp.max(below, least + margin - wp.dot(normal, start))
     return (ONE + _ROUNDING) * wp.length(end - start) + WEDGE * below
 
 

@@ -78,10 +78,7 @@ def bits_of_model(
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Returns groups and masks of particles and of shapes, uint32, each of shape [2, n]; None if no pair is left out.
 
-    Args:
-        model: The model.
-        collision_filter: The filter of the stage, or None.
-        apart: Which shapes meet other shapes, but no particles, bool, shape [shape_count].
+    Shapes that are ``apart`` meet other shapes, but no particles, bool, shape [shape_count].
 
     Raises:
         ValueError: If the filter does not fit the model, or has more than 16 groups where some shapes are apart.

@@ -16,25 +16,16 @@ _OF_MODEL = "model"
 
 @dataclass(frozen=True, eq=False)
 class KeptDistances:
-    """Distances that pairs keep: the sum of the radii or margins of both sides, and a minimum.
+    """Distances that pairs keep: the sum of the radii or margins of both sides, and a minimum."""
 
-    Attributes:
-        minimum: Of all pairs [m].
-        radii: Radius of each particle [m], float64, shape [particle_count].
-        margins: Margin of each shape [m], float64, shape [shape_count].
-        is_chosen: Whether the program gave the minimum, be it 0.
-        has_fixed_margins: Whether margins are those that the model had.
-        arrays: Arrays from which each step reads the minimum, radii and margins again; None for what stays as it is.
-        has_radius: Which particles have a radius.
-    """
-
-    minimum: float
-    radii: np.ndarray
-    margins: np.ndarray
-    is_chosen: bool
-    has_fixed_margins: bool
+    minimum: float  # of all pairs [m]
+    radii: np.ndarray  # radius of each particle [m], float64, shape [particle_count]
+    margins: np.ndarray  # margin of each shape [m], float64, shape [shape_count]
+    is_chosen: bool  # whether the program gave the minimum, be it 0
+    has_fixed_margins: bool  # whether margins are those that the model had
+    # arrays from which each step reads the minimum, radii and margins again; None for what stays as it is
     arrays: tuple[wp.array | None, ...]
-    has_radius: np.ndarray
+    has_radius: np.ndarray  # which particles have a radius
 
     @classmethod
     def of(

@@ -93,10 +93,8 @@ class LastStep:
         self.interrupted.zero_()
 
     def interrupt(self, world_mask: wp.array[wp.bool] | None = None) -> None:
-        """Makes the next step begin where its state is.
+        """Makes the next step begin where its state is, in the worlds of a mask, or everywhere.
 
-        Args:
-            world_mask: Which worlds, and as the last entry whether also everything that is in all worlds, shape
-                [world_count + 1]; None for everything.
+        Its last entry says whether also everything that is in all worlds does, shape [world_count + 1].
         """
         interrupt_worlds(self.interrupted, world_mask)

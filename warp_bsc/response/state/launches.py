@@ -7,7 +7,6 @@ import warp as wp
 from ...detection.run.launch import cores_for, launch_on_cores
 from .mesh import ModelMesh
 from .structs import Step
-from .team import BLOCK
 
 
 class Launches:
@@ -23,11 +22,6 @@ class Launches:
     def launch(self, kernel: wp.Kernel, size: int | tuple[int, ...], inputs: Sequence, outputs: Sequence = ()) -> None:
         """Launches a kernel on the device."""
         wp.launch(kernel, size, inputs=inputs, outputs=outputs, device=self.device)
-
-    def launch_in_block(self, kernel: wp.Kernel, inputs: Sequence) -> None:
-        """Launches a kernel by one block of threads that wait for each other; their number is its last input."""
-        threads = 1 if self.device.is_cpu else BLOCK
-        wp.launch(kernel, threads, inputs=[*inputs, threads], device=self.device, block_dim=BLOCK)
 
     def launch_over_entries(
         self, kernel: wp.Kernel, inputs: Sequence, *, on_cores: bool = False, is_large: bool = False

@@ -194,9 +194,7 @@ class ModelMesh(CollisionMesh):
     def keep_distances(self, kept: KeptDistances, *, reach: float) -> None:
         """Makes pairs keep distances, see :mod:`warp_bsc.detection.narrow.rules.approach`.
 
-        Args:
-            kept: The distances that pairs keep.
-            reach: How much farther apart than their minimum distance the pairs of a proximity are at most [m].
+        Those of a proximity are farther apart than their minimum distance by at most the ``reach`` [m].
         """
         count, rigid_id = self.model.particle_count, np.full(self.vertex_count, -1)
         half = 0.5 * kept.minimum

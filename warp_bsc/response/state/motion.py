@@ -202,7 +202,6 @@ class ModelMotion:
     Attributes:
         vertices: The vertices, :class:`.state.structs.Motion`.
         planes: The infinite planes, :class:`.state.planes.MovingPlanes`.
-        mesh: The mesh.
         last: Where the last step ended.
         friction: The coefficients of its vertices and planes.
         moves_bodies: Whether the response can move bodies.

@@ -81,7 +81,6 @@ class SolveStatus:
     is_stuck: wp.array[int]  # of each world, 1 if a vertex collides that was frozen lately
     is_fast: wp.array[int]  # of each world, 1 if predicted paths of fast or pushing elements or bodies collide
     crossings: wp.array[int]  # of each world, edges that cross faces at the start
-    arrived: wp.array[int]  # how often blocks have waited for each other in these sweeps, see team.wait_for_team
     of_worlds: WorldCounts
     max_iterations: int
     max_slow_iterations: int
@@ -122,16 +121,13 @@ def clear_status(status: SolveStatus):
 
 
 @wp.func
-def begin_sweeps(status: SolveStatus):
-    """Clears the count of sweeps; there is none in an iteration that divides."""
-    loop = status.loop
-    loop[Loop.SWEEP] = 0
-    loop[Loop.MORE_SWEEPS] = wp.where(loop[Loop.ACTIVE] == 0 or loop[Loop.PROJECTING] == 1, 1, 0)
-    loop[Loop.PROJECTING] = 0
-    status.arrived[0] = 0
+def has_sweeps(status: SolveStatus) -> bool:
+    """Returns whether there are sweeps: there is none in an iteration that only divides."""
+    return status.loop[Loop.ACTIVE] == 0 or status.loop[Loop.PROJECTING] == 1
 
 
 @wp.kernel
 def start_sweeps(status: SolveStatus):
-    """Launches :func:`begin_sweeps`."""
-    begin_sweeps(status)
+    """Clears the count of sweeps of which each is launched."""
+    status.loop[Loop.SWEEP] = 0
+    status.loop[Loop.MORE_SWEEPS] = wp.where(has_sweeps(status), 1, 0)

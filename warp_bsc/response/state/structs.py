@@ -236,6 +236,8 @@ def has_final_velocity(outcome: int) -> bool:
     return cut or outcome & (FROZEN | NOT_FINITE | UNCONSTRAINED) != 0
 
 
+NO_NODE = wp.constant(-1)
+"""In place of a node: the end of a list."""
 NOT_PLACED, PLACED, CUT_SHORT = (wp.constant(i) for i in (0, 1, 2))
 """Of a vertex: it has no wanted end; it has one; projection found it no position above its planes but on its way."""
 
@@ -244,9 +246,9 @@ NOT_PLACED, PLACED, CUT_SHORT = (wp.constant(i) for i in (0, 1, 2))
 class DividingPlanes:
     """Planes that vertices stay above or below, and a list for each vertex of those that concern it.
 
-    The planes of two elements have four vertices, so that four lists have each. These planes move, see
-    :mod:`.solve.plane_placement`, whose passes begin with the lists, one behind the other: a GPU reads the next planes
-    of a list before it is done with one.
+    The planes of two elements have four vertices, so that there are four nodes for each. A node is the number
+    ``8 plane + 2 corner + side``, side 1 of a vertex below, as this is what its vertex asks for: less to read where all
+    is scattered in memory. These planes move, see :mod:`.solve.plane_placement`.
     """
 
     count: wp.array[int]  # of planes, whether they fit or not
@@ -256,13 +258,10 @@ class DividingPlanes:
     half: wp.array[wp.float64]  # of the minimum distance of both elements [m]; empty without minimum distances
     margin: wp.array[float]  # by which projection exceeds it [m]
     split: wp.array[wp.int8]  # the first corner that stays below
-    rank: wp.array[int]  # of each corner of a plane, the place of the plane in the list of that vertex
-    number: wp.array[int]  # of planes of a vertex
-    begin: wp.array[int]  # of a vertex, where its list begins
-    sides: wp.array[int]  # the lists: twice a plane, and 1 more of a vertex that stays below
-    listed: wp.array[wp.int64]  # length of all lists that have begun
-    listed_vertices: wp.array[int]  # vertices that have planes
-    vertex_count: wp.array[int]  # their number
+    next: wp.array[int]  # of half of a node, the next one in the list of the same vertex, or NO_NODE
+    first: wp.array[int]  # node of a vertex, or NO_NODE
+    listed: wp.array[int]  # particles that have planes
+    listed_count: wp.array[int]  # their number
     lacks: wp.array[int]  # of a vertex, 1 if it has contacts without a plane
     placed: wp.array[int]  # of a vertex: NOT_PLACED, PLACED or CUT_SHORT
     wanted: wp.array[wp.vec3]  # where a vertex is to end, as near as its planes let it come [m]

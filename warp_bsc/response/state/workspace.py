@@ -27,6 +27,7 @@ from ..tuning import (
     THREADS,
     TOLERANCE,
 )
+from .cluster import BLOCK, begin_worlds, count_constraints, list_constraints, threads_of_world
 from .launches import Launches
 from .mesh import ModelMesh, grouped_by_world
 from .motion import ModelMotion, continues, takes_part
@@ -34,6 +35,7 @@ from .status import Detection, Loop, Result, SolveStatus, WorldCounts, clear_sta
 from .structs import (
     FROZEN,
     NEVER,
+    NO_NODE,
     NOT_FINITE,
     NOT_PLACED,
     SUMS,
@@ -45,15 +47,6 @@ from .structs import (
     Tetrahedra,
     Vertices,
     allocate,
-)
-from .team import (
-    BLOCK,
-    LARGE_BLOCK,
-    begin_worlds,
-    count_constraints,
-    list_constraints,
-    threads_of_large_team,
-    threads_of_world,
 )
 
 wp.set_module_options({"enable_backward": False})
@@ -98,7 +91,7 @@ def _begin(step: Step, worlds: int, dividing: DividingPlanes, status: SolveStatu
         left = wp.where(vertices.outcome[i] & FROZEN != 0, STUCK_STEPS, vertices.frozen_lately[i] - 1)
         vertices.frozen_lately[i] = wp.where(continues(motion, motion.world[i]), wp.max(left, 0), 0)
     vertices.outcome[i] = wp.where(motion.is_not_finite[i] != 0, NOT_FINITE, 0)
-    dividing.number[i] = 0
+    dividing.first[i] = NO_NODE
     dividing.lacks[i] = 0
     dividing.placed[i] = NOT_PLACED
 
@@ -111,12 +104,7 @@ def _forget_crossings(world_mask: wp.array[wp.bool], step: Step, last_crossings:
 
 
 def pairs_of(mesh: ModelMesh, can_move: np.ndarray) -> int:
-    """Returns how many pairs fit into the queues of a mesh on a GPU at first.
-
-    Args:
-        mesh: The mesh.
-        can_move: 1 of each vertex that can move.
-    """
+    """Returns how many pairs fit into the queues of a mesh on a GPU at first; ``can_move`` is 1 of each that can."""
     elements = mesh.faces, mesh.edges[mesh.free_edges], mesh.points.reshape(-1, 1)
     count, moving = sum(map(len, elements)), sum(int(can_move[e].any(axis=1).sum()) for e in elements)
     return PAIRS_PER_FACE * moving + PAIRS_PER_STATIC_FACE * (count - moving)
@@ -129,7 +117,6 @@ def _allocate_status(worlds: int, device: wp.Device, max_iterations: int) -> Sol
         setattr(status, name, wp.zeros(len(fields), dtype=int, device=device))
     for name in ("contact_iteration", "idle", "is_stuck", "is_fast", "crossings"):
         setattr(status, name, wp.zeros(worlds, dtype=int, device=device))
-    status.arrived = wp.zeros(1, dtype=int, device=device)
     status.max_iterations = max_iterations
     status.max_slow_iterations = MAX_SLOW_ITERATIONS
     status.max_divisions = MAX_DIVISIONS
@@ -142,16 +129,13 @@ class Workspace(Launches):
 
     Attributes:
         step: The elements; the motion, which is only read; vertices and bodies as they are moved; the constraints.
-        dividing: The dividing planes.
         loop: Views of single elements of ``status.loop``, by :class:`.status.Loop`, for conditions on the device.
         results: The same of ``status.results``, by :class:`.status.Result`.
         tolerance: Tolerance of constraints on positions [m].
         crossings_of_edges: Faces that each edge crosses at the start of the step.
         last_crossings: The same of the step before; very many in a first step, whose start is as a program made it.
-        nearest: How far each vertex is from the nearest face in each of six directions [m], see
-            :mod:`.contacts.occluders`.
+        nearest: How far each vertex is from the nearest face in six directions [m], see :mod:`.contacts.occluders`.
         clipped: Where paths end that are clipped there.
-        worlds: Number of worlds.
         can_move: 1 of each vertex that is not of a static shape: pairs without one are not looked for.
         active: The same, 0 of those that take no part in the step.
         turns: How bodies turn, None if no body has a shape.
@@ -159,9 +143,7 @@ class Workspace(Launches):
         tetrahedra: The tetrahedra whose inversions are looked for, None if nobody asks.
         ends: Where particles ended before inversions were prevented; None if they are not.
         unmasked: Inverse masses of vertices and bodies while those that take no part have none.
-        particles: The particles of each world.
-        sweeping_threads: Threads of each world that make all its sweeps in one launch; 0 if each is launched, as those
-            of bodies are.
+        sweeping_threads: Threads of each world that make all its sweeps in one launch; 0 to launch each, as of bodies.
     """
 
     def __init__(
@@ -173,14 +155,9 @@ class Workspace(Launches):
         max_iterations: int = MAX_ITERATIONS,
         has_few_contacts: bool = False,
     ):
-        """Allocates buffers.
+        """Allocates buffers, less where ``has_few_contacts`` says what is to be expected.
 
-        Args:
-            motion: The motion of steps.
-            separation: As of :class:`.Step` [m].
-            restitution: As of :class:`.Step`.
-            max_iterations: Iterations of detect and project, see :mod:`.schedule`.
-            has_few_contacts: Whether few contacts are to be expected, which takes less memory.
+        Separation and restitution are those of :class:`.Step`, iterations those of :mod:`.schedule`.
         """
         self.mesh = mesh = motion.mesh
         self.device, vertices = mesh.device, mesh.vertex_count
@@ -216,14 +193,12 @@ class Workspace(Launches):
         self.particles = self._find_particles()
         largest = int(np.diff(self.particles.first.numpy()).max())
         self.sweeping_threads = 0 if self.body_count else threads_of_world(device, self.worlds, largest)
-        self._large_team = 0 if self.body_count else threads_of_large_team(device)
         self._iterations_reserved = ITERATIONS_RESERVED_IF_FEW if has_few_contacts else ITERATIONS_RESERVED
         step.constraints = self._allocate_constraints(0)
         self._retired: list[wp.array] = []
         capacity = (DIVIDING_PLANES_IF_FEW if has_few_contacts else DIVIDING_PLANES) * self.particle_count
-        sizes = {"count": 1, "listed": 1, "vertex_count": 1, "moved": self.worlds, "missed": self.worlds}
-        sizes |= dict.fromkeys(("rank", "sides"), 4 * capacity)
-        sizes |= dict.fromkeys(("number", "begin", "listed_vertices", "lacks", "placed", "wanted", "reached"), vertices)
+        sizes = {"count": 1, "listed_count": 1, "next": 4 * capacity, "moved": self.worlds, "missed": self.worlds}
+        sizes |= dict.fromkeys(("first", "listed", "lacks", "placed", "wanted", "reached"), vertices)
         self.dividing = allocate(DividingPlanes, capacity, device, **sizes, half=self._if_distances(capacity))
         self.status = _allocate_status(self.worlds, device, max_iterations)
         self.loop, self.results = single_elements(self.status.loop), single_elements(self.status.results)
@@ -351,43 +326,32 @@ class Workspace(Launches):
         return True
 
     def sweep_by_world(self, kernel: Callable[[int], wp.Kernel], inputs: Sequence) -> None:
-        """Launches a kernel that makes all sweeps over each world, of a number of blocks, see :mod:`.team`.
+        """Launches a kernel that makes all sweeps over each world, of a number of blocks, see :mod:`.cluster`.
 
         Its first inputs are the step and the particles of worlds, its last one is the threads of a world.
         """
         if self.worlds > 1:
             self.constraints.number.zero_()
             self.launch_over_constraints(count_constraints)
-        self.launch(begin_worlds, self.worlds, [self.step, self.status])
-        if self.worlds > 1:
+            self.launch(begin_worlds, self.worlds, [self.step])
             self.launch_over_constraints(list_constraints)
         threads = self.sweeping_threads
         inputs = [self.step, self.particles, *inputs, threads]
         options = {"device": self.device, "block_dim": min(threads, BLOCK)}
         wp.launch(kernel(max(1, threads // BLOCK)), self.worlds * threads, inputs=inputs, **options)
 
-    def sweep(
-        self, number: int, activate: Callable[[], None], together: wp.Kernel, project: wp.Kernel, update: Callable
-    ) -> None:
+    def sweep(self, number: int, activate: Callable[[], None], project: wp.Kernel, update: Callable) -> None:
         """Sweeps a number of times over one active set, which ``activate`` fills, see :mod:`.solve.sweeps`.
 
-        The kernel ``together`` makes all sweeps, if there is a :func:`.team.large_team`. Else the kernel ``project``
-        updates multipliers; then ``update(work, last)`` changes vertices and bodies.
+        The kernel ``project`` updates multipliers; then ``update(work, last)`` changes vertices and bodies.
         """
         activate()
-        if self._large_team:
-            inputs = [self.step, self.particles, self.status, number, self._large_team]
-            wp.launch(together, self._large_team, inputs=inputs, device=self.device, block_dim=LARGE_BLOCK)
-            return
         for i in range(number):
             self.launch_over_constraints(project, self.status)
             update(self, i == number - 1)
 
-    def repeat_sweeps(
-        self, activate: Callable[[], None], together: wp.Kernel, project: wp.Kernel, update: Callable
-    ) -> None:
+    def repeat_sweeps(self, activate: Callable[[], None], project: wp.Kernel, update: Callable) -> None:
         """Repeats batches of sweeps until no constraint is active, at most MAX_SWEEPS times; none in divided worlds."""
         self.launch(start_sweeps, 1, [self.status])
-        kernels = {"together": together, "project": project}
-        batch = {"number": int(SWEEPS_PER_BATCH), "activate": activate, **kernels, "update": update}
+        batch = {"number": int(SWEEPS_PER_BATCH), "activate": activate, "project": project, "update": update}
         wp.capture_while(self.loop[Loop.MORE_SWEEPS], self.sweep, **batch)

@@ -17,15 +17,9 @@ MAX_PAIRS = 2**20
 
 
 class ContactForces:
-    """Sums up what contacts did to momentum in a step, and publishes it, without a change of the step.
+    """Sums up what contacts did to momentum in a step, and publishes it, without a change of the step."""
 
-    Attributes:
-        rows: The contacts of the last step.
-        published: The sums of the last step.
-        shapes_of_worlds: The shapes of each world, see :class:`.contact_report.ContactReport`.
-        more: Publishes the contacts that were in the solve, if there are some.
-    """
-
+    # publishes the contacts that were in the solve, if there are some
     more: Callable[[Sides, wp.array[wp.vec3d], ImpulseSums, ContactRows], None] | None = None
 
     def __init__(self, work: Workspace, capacity: int):
@@ -33,6 +27,7 @@ class ContactForces:
         self._work, device, mesh = work, work.device, work.mesh
         model, worlds = mesh.model, work.worlds
         shape_world = host_array(model.shape_world) if model.shape_count else np.zeros(0, dtype=np.int32)
+        # the shapes of each world, see :class:`.contact_report.ContactReport`
         self.shapes_of_worlds = members_of_worlds(shape_world, worlds)
         self._sides = Sides()
         self._set_sides(_numbers_in(self.shapes_of_worlds, model.shape_count))
@@ -46,10 +41,10 @@ class ContactForces:
         sizes = {"of_particles": particles, "of_bodies": bodies, "of_shapes": shapes, "of_pairs": pairs}
         columns = {name: (size, 6 if name == "of_bodies" else 3) for name, size in sizes.items()}
         self._sums = allocate(ImpulseSums, worlds, device, **columns)
-        self.rows = allocate(ContactRows, capacity, device, count=1, lost=1)
+        self.rows = allocate(ContactRows, capacity, device, count=1, lost=1)  # the contacts of the last step
         by = dict.fromkeys(("particle", "unpaired_particle"), particles)
         by |= {"shape": shapes, "pair": pairs, "max_impulse": worlds}
-        self.published = allocate(PublishedImpulses, bodies, device, **by)
+        self.published = allocate(PublishedImpulses, bodies, device, **by)  # the sums of the last step
         self.published.max_impulse = self._sums.largest
         self._size = max(particles, bodies, shapes, pairs)
 

@@ -114,14 +114,9 @@ class ContactReport:
     def __init__(
         self, model: newton.Model, rows: ContactRows, published: PublishedImpulses, shapes_of_worlds: np.ndarray
     ):
-        """Takes the arrays that each step writes.
+        """Takes the contacts and the sums that each step writes.
 
-        Args:
-            model: The model.
-            rows: The contacts.
-            published: The sums.
-            shapes_of_worlds: The shapes of each world, those in all worlds first, then -1, int32, shape
-                [world_count, n].
+        Shapes of worlds are those of each world, those in all worlds first, then -1, int32, shape [world_count, n].
         """
         self._model, self._rows, self._of_pairs, self.shapes_of_worlds = model, rows, published.pair, shapes_of_worlds
         self.particle_impulse, self.unpaired_particle_impulse = published.particle, published.unpaired_particle
