@@ -137,6 +137,44 @@ def test_few_faces_and_many_alike(faces):
     assert find_pairs(BroadPhaseHierarchy, mesh, x0, x1) == all_pairs(mesh, x0, x1)
 
 
+@pytest.mark.parametrize("broad_phase", [BroadPhaseSimd, BroadPhaseHierarchy])
+@pytest.mark.parametrize("padded", [False, True])
+@pytest.mark.parametrize("parts", [1, 3])
+def test_pairs_of_clipped_paths_are_found_among_those_of_the_run_before(
+    broad_phase, padded, parts, device, monkeypatch
+):
+    """Traversed once, or again in a large mesh, they are those of a run of their own."""
+    if broad_phase is BroadPhaseSimd and wp.get_device(device).is_cuda:
+        pytest.skip("SIMD packets are for the CPU")
+    monkeypatch.setattr(broad_phase_hierarchy, "CLUSTERS_OF_PART", 8 if parts > 1 else 2**15)
+    rng = np.random.default_rng(0)
+    centres, ways = rng.uniform(-1.0, 1.0, (500, 1, 3)), rng.uniform(-0.3, 0.3, (500, 1, 3))
+    x0 = centres + rng.uniform(-0.05, 0.05, (500, 3, 3))
+    x0, x1 = ((x0 + way).reshape(-1, 3).astype(np.float32) for way in (0.0, ways))
+    ends = np.where(rng.integers(0, 2, x0.shape) == 1, x0, x1)
+    mesh = bsc.CollisionMesh(np.arange(1500).reshape(-1, 3), len(x0), device=device)
+    padding = wp.full(len(x0), 0.02, dtype=wp.float64, device=device) if padded else None
+    x0, x1, ends = (wp.array(x, dtype=wp.vec3, device=device) for x in (x0, x1, ends))
+    found = []
+    for again in (False, True):
+        finder = broad_phase(mesh, wp.zeros(1, dtype=wp.int64, device=device), padding=padding)
+        finder.grow(1_000_000)
+        counts = wp.zeros((2, len(Count)), dtype=wp.int64, device=device)
+        queues = [wp.zeros(400_000, dtype=wp.vec2i, device=device) for _ in range(2)]
+        out = counts[0], queues[0], counts[1], queues[1]
+        if again:
+            finder.pair_elements(x0, x1, *out, keep_separated=True)
+            more = counts.numpy()[:, Count.QUEUED].copy()
+            counts.zero_()
+            finder.pair_elements_again(x0, ends, *out)
+            assert (more > counts.numpy()[:, Count.QUEUED]).all()
+        else:
+            finder.pair_elements(x0, ends, *out, keep_separated=True)
+        numbers = counts.numpy()[:, Count.QUEUED]
+        found.append([in_lexicographic_order(q.numpy()[:n]) for q, n in zip(queues, numbers, strict=True)])
+    assert found[0] == found[1] and all(found[0])
+
+
 def face_pairs(mesh, x0, x1, changed=None, keep_separated=False):
     """Pairs of faces that a hierarchy enqueues, sorted within and among each other, shape [n, 2]."""
     device = mesh.device
