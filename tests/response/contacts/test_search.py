@@ -11,6 +11,7 @@ from sheets import crumpled
 from small_queues import stage
 
 import warp_bsc as bsc
+from warp_bsc.response.contacts import proximities
 from warp_bsc.response.contacts.detect import inspect
 from warp_bsc.response.contacts.proximities import add_proximities
 from warp_bsc.response.state.motion import arrays_of
@@ -102,7 +103,7 @@ def test_contacts_are_those_of_a_detection_with_queues(seed, device, monkeypatch
 
 @pytest.mark.slow
 def test_proximities_of_the_hierarchy_are_those_of_trees(monkeypatch):
-    """With the nearest faces found without a queue, constraints are the same, and layers fall to the same positions."""
+    """With the nearest faces found among pairs of faces, constraints are the same, and layers fall to the same ends."""
     monkeypatch.setattr("warp_bsc.response.step.proximities.add_proximities", record_proximities(found := []))
     model = pile(12)
     solvers = stage(model, monkeypatch, tiny=False), bsc.SolverCCD(SOLVERS["vbd"](model))
@@ -119,6 +120,21 @@ def test_proximities_of_the_hierarchy_are_those_of_trees(monkeypatch):
         for start in starts:
             start.assign(ends[0])
     assert most > 3000
+
+
+def test_paths_that_overlap_too_many_others_have_no_proximities(device, monkeypatch):
+    """As those of fast elements do; what such a step finds is resolved all the same."""
+    monkeypatch.setattr("warp_bsc.response.step.proximities.add_proximities", record_proximities(found := []))
+    model = pile(3, device=device, cells=8)
+    for most in (512, 0):
+        monkeypatch.setattr(proximities, "MOST_PAIRS_PER_FACE", most)
+        rollout = Rollout(model, stage(model, monkeypatch, tiny=False))
+        for _ in range(60):
+            rollout.step(PILE_DT)
+            assert rollout.solver.report.certified
+        assert rollout.collisions == 0
+        assert any(found) == (most > 0)
+        found.clear()
 
 
 def record_proximities(found):

@@ -13,7 +13,7 @@ from ..state.status import Loop, SolveStatus
 from ..state.structs import ContactKind, Pace, Step, constraint_count
 from ..state.vectors import ZERO, corners_of
 from ..state.workspace import Workspace
-from ..tuning import REACH, RESTING_PATH
+from ..tuning import MOST_PAIRS_PER_FACE, REACH, RESTING_PATH
 from . import constraints
 from .closest_points import closest_vector
 from .occluders import clip_paths, find_nearest_in_queue, is_behind, nearest_among_faces_kernel
@@ -157,7 +157,8 @@ def add_proximities(work: Workspace) -> None:
     nearest, ends = work.nearest, work.clipped
     wp.copy(work.kept, work.constraints.count)
     nearest.fill_(np.inf)
-    _find_nearest(work)
+    if not _find_nearest(work):
+        return
     work.launch_over_constraints(disable_contacts_behind, nearest, work.status)
     work.launch(clip_paths, len(ends), [work.step, nearest, work.status, ends])
     _collect(work, ends)
@@ -166,21 +167,32 @@ def add_proximities(work: Workspace) -> None:
 
 
 def _find_nearest(work):
-    """Finds the nearest faces on the ways of all vertices in the last detection."""
+    """Finds the nearest faces on the ways of all vertices in the last detection; returns False if these are too many.
+
+    Those of fast elements, which have no proximities, may overlap all others: their pairs would fill the memory.
+    """
     detector, broad_phase = work.detector, work.detector.broad_phase
+    has_hierarchy = isinstance(broad_phase, BroadPhaseHierarchy)
 
     def find() -> None:
         detector.counters.array.zero_()
-        if isinstance(broad_phase, BroadPhaseHierarchy):  # pairs of elements need no queue
+        if has_hierarchy:  # pairs of elements need no queue
             among_faces = nearest_among_faces_kernel, [work.step, work.nearest]
             broad_phase.pair_faces(work.step.motion.x0, work.vertices.x1, work.active, True, among_faces)
         else:
             broad_phase.pair_vertices_with_faces(detector.vertex_face.counts, detector.vertex_face.queue)
 
-    retry_until_fits(find, detector, work.device)
-    if not isinstance(broad_phase, BroadPhaseHierarchy):
-        queue = queues_of(detector, candidates=True)[0]
-        work.launch_over_entries(find_nearest_in_queue, [work.step, queue, work.nearest])
+    find()
+    while not work.device.is_capturing:
+        if detector.counters.read().face_pairs > MOST_PAIRS_PER_FACE * len(work.mesh.cells):
+            return False
+        if not detector.grow():
+            break
+        find()
+    if not has_hierarchy:
+        inputs = [work.step, queues_of(detector, candidates=True)[0], work.nearest]
+        work.launch_over_entries(find_nearest_in_queue, inputs)
+    return True
 
 
 def _collect(work, ends):

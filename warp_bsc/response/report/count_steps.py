@@ -44,21 +44,14 @@ def _marks(step: Step, vertex: int, is_particle: bool, responds: bool) -> int:
     return bits
 
 
-@wp.func
-def _note_crossings(status: SolveStatus):
-    """Says whether the next step, or substep, has to count crossings at its start."""
-    results = status.results
-    # a certified motion of elements that did not cross makes no crossings
-    unchanged = is_certified(results) and results[Result.CROSSINGS] == 0 and results[Result.EXCLUDED] == 0
-    status.loop[Loop.RECOUNT] = wp.where(unchanged, 0, 1)
-
-
 @wp.kernel
 def merge_step(step: Step, status: SolveStatus, particle_count: int, responds: bool, first: bool, out: StepResults):
     """Adds what a step, or a substep, did to the results, in place of those of the last step if it is the ``first``."""
     i = wp.tid()
-    if i == 0:
-        _note_crossings(status)
+    if i == 0:  # the next one counts crossings at its start, but for a certified motion of what did not cross
+        results = status.results
+        unchanged = is_certified(results) and results[Result.CROSSINGS] == 0 and results[Result.EXCLUDED] == 0
+        status.loop[Loop.RECOUNT] = wp.where(unchanged, 0, 1)
     if i < out.results.shape[0]:
         found = status.results[i]
         out.results[i] = wp.where(first, found, _merged(i, out.results[i], found))

@@ -55,7 +55,7 @@ def measure_strain(
     change = wp.max(length - wp.max(start, lengths[i]), COMPRESSION * (wp.min(start, lengths[i]) - length))
     if is_solid[i]:
         change = SOLID * wp.abs(length - start)
-    largest = _largest_of_warp(wp.max(change, 0.0) / lengths[i], motion.world[a])
+    largest = _largest_of_warp(wp.where(change > 0.0, change / lengths[i], 0.0), motion.world[a])
     if largest > 0.0:  # few atomic operations: those on one number wait for each other
         wp.atomic_max(strain, motion.world[a], largest)
 

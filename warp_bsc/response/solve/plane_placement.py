@@ -24,9 +24,6 @@ from .vertex_projection import position_on_sides, position_on_way
 
 wp.set_module_options({"enable_backward": False})
 
-FEW_PLANES = wp.constant(BLOCK)
-"""Planes up to which one block of threads makes all passes, a plane each."""
-
 
 @wp.func
 def want(planes: DividingPlanes, vertex: int, end: wp.vec3):
@@ -42,7 +39,7 @@ def begin_passes(step: Step, planes: DividingPlanes, particles: int, worlds: int
     if i == 0:
         status.loop[Loop.PROJECTING] = 0  # sweeps are over; the next detection says whether there are others
         status.loop[Loop.PASS] = 0
-        status.loop[Loop.MORE_PASSES] = wp.where(planes.count[0] > FEW_PLANES, 1, 0)
+        status.loop[Loop.MORE_PASSES] = wp.where(planes.count[0] > BLOCK, 1, 0)
     if i < worlds:
         before = status.loop[Loop.ITERATION] - 1
         if status.contact_iteration[i] == before and divides_after(status, i, before):
@@ -189,10 +186,10 @@ def move_to_sides(step: Step, planes: DividingPlanes, tolerance: wp.float64, sta
 
 @wp.kernel(module="unique", enable_backward=False, launch_bounds=BLOCK)
 def pass_over_few_planes(step: Step, planes: DividingPlanes, tolerance: wp.float64, status: SolveStatus, threads: int):
-    """Makes all passes over at most ``FEW_PLANES`` in one block of threads, which takes less time than launches."""
+    """Makes all passes over planes of which each thread of a block has one at most, in less time than launches."""
     thread, particles = wp.tid(), int(planes.listed_count[0])
     count = wp.min(planes.count[0], planes.place.shape[0])
-    more = count > 0 and planes.count[0] <= FEW_PLANES
+    more = count > 0 and planes.count[0] <= BLOCK
     while more:
         wait_for_block()
         if thread == 0:
