@@ -15,6 +15,8 @@ import warp_bsc as bsc
 from warp_bsc.response.contacts.first_contact import packed_contact
 from warp_bsc.response.contacts.planes_between import add_plane, add_solid, has_planes
 from warp_bsc.response.solve.vertex_projection import position_on_sides
+from warp_bsc.response.state.cluster import BLOCK
+from warp_bsc.response.state.status import Loop
 from warp_bsc.response.state.structs import DIVIDED, NEVER, NO_NODE, DividingPlanes, Motion, allocate
 
 
@@ -455,3 +457,34 @@ def test_what_is_pressed_onto_the_ground_does_not_come_ever_nearer(device):
         state, end = end, state
     assert solver.report.totals.uncertified_steps == solver.report.totals.frozen_steps == 0
     assert state.particle_q.numpy()[:9, 2].min() > 1e-7
+
+
+def falling_patches(worlds, device):
+    """Patches that fall onto each other by more than they are apart, and onto one that is held at its border."""
+    world = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    add_patch(world, 4, 0.05, (0.0, 0.0, 0.0), fixed=True)
+    for k in range(1, 5):
+        add_patch(world, 2, 0.05, (0.003 * k, 0.002 * k, 0.004 * k), velocity=(0.0, 0.0, -0.3 * k))
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    builder.replicate(world, worlds)
+    builder.color()
+    return builder.finalize(device=device)
+
+
+def test_few_planes_are_passed_over_as_many_are(device):
+    """Those of one world by one block of threads, those of many worlds by launches, to the same bits."""
+    ends, planes, passes = [], [], []
+    for worlds in (1, 8):
+        model = falling_patches(worlds, device)
+        solver, states = bsc.SolverCCD(Changed(model)), [model.state(), model.state()]
+        counts = []
+        for _ in range(8):
+            solver.step(*states, None, None, DT)
+            states.reverse()
+            counts.append([solver.work.dividing.count.numpy()[0], solver.work.loop[Loop.PASS].numpy()[0]])
+        (most, most_passes), x = np.max(counts, axis=0), states[0].particle_q.numpy()
+        planes.append(most)
+        passes.append(most_passes)
+        ends.append(x.reshape(worlds, -1))
+    assert 0 < planes[0] <= BLOCK < planes[1] and min(passes) > 2
+    np.testing.assert_array_equal(ends[1], np.repeat(ends[0], 8, axis=0))
