@@ -27,26 +27,16 @@ _REACH = 0.01
 
 @wp.struct
 class SolvedBodies:
-    """The bodies in a solve; empty if none is solved for.
+    """The bodies in a solve; empty if none is solved for."""
 
-    Attributes:
-        unknown: First unknown of each body, -1 for none.
-        first_vertex: First vertex of each.
-        goal: Pose to which inertia leads.
-        pose: Pose now.
-        moved: Pose after a share of its displacement.
-        low, low_moved: What their rounding takes from the centre of mass in both [m].
-        inertia: Moments in the goal, in the frame of the world [kg m^2].
-    """
-
-    unknown: wp.array[int]
-    first_vertex: wp.array[int]
-    goal: wp.array[wp.transform]
-    pose: wp.array[wp.transform]
-    moved: wp.array[wp.transform]
-    low: wp.array[wp.vec3d]
-    low_moved: wp.array[wp.vec3d]
-    inertia: wp.array[wp.mat33d]
+    unknown: wp.array[int]  # first unknown of each body, -1 for none
+    first_vertex: wp.array[int]  # first vertex of each
+    goal: wp.array[wp.transform]  # pose to which inertia leads
+    pose: wp.array[wp.transform]  # pose now
+    moved: wp.array[wp.transform]  # pose after a share of its displacement
+    low: wp.array[wp.vec3d]  # what rounding takes from the centre of mass in ``pose`` [m]
+    low_moved: wp.array[wp.vec3d]  # the same in ``moved``
+    inertia: wp.array[wp.mat33d]  # moments in the goal, in the frame of the world [kg m^2]
 
 
 def reach_between_bodies(mesh: ModelMesh) -> np.ndarray:

@@ -68,31 +68,19 @@ def make_team(unknowns: int, worlds: int, device: wp.Device) -> tuple[Team, int,
 
 @wp.struct
 class Vectors:
-    """Vectors of a solve, each of one vec3 by unknown.
+    """Vectors of a solve, each of one vec3 by unknown."""
 
-    Attributes:
-        elastic: Gradient of the energy of elements [N].
-        gradient: Of the energy [N].
-        inverse: Inverted blocks of the diagonal, which precondition, shape [unknown_count].
-        solution: The displacements [m]; those that are given, before.
-        residual, preconditioned: Of the iteration; the second is the first by ``inverse``.
-        product: Of the Hessian and ``preconditioned``.
-        direction, along: In which the solution changes, and the product with it.
-        first: Solution of the Newton step before pairs are held.
-        last: The same of the Newton step before.
-    """
-
-    elastic: wp.array[wp.vec3]
-    gradient: wp.array[wp.vec3]
-    inverse: wp.array[wp.mat33]
-    solution: wp.array[wp.vec3]
-    residual: wp.array[wp.vec3]
-    preconditioned: wp.array[wp.vec3]
-    product: wp.array[wp.vec3]
-    direction: wp.array[wp.vec3]
-    along: wp.array[wp.vec3]
-    first: wp.array[wp.vec3]
-    last: wp.array[wp.vec3]
+    elastic: wp.array[wp.vec3]  # gradient of the energy of elements [N]
+    gradient: wp.array[wp.vec3]  # of the energy [N]
+    inverse: wp.array[wp.mat33]  # inverted blocks of the diagonal, which precondition, shape [unknown_count]
+    solution: wp.array[wp.vec3]  # the displacements [m]; those that are given, before
+    residual: wp.array[wp.vec3]  # of the iteration
+    preconditioned: wp.array[wp.vec3]  # the residual by ``inverse``
+    product: wp.array[wp.vec3]  # of the Hessian and ``preconditioned``
+    direction: wp.array[wp.vec3]  # in which the solution changes
+    along: wp.array[wp.vec3]  # the product of the Hessian with it
+    first: wp.array[wp.vec3]  # solution of the Newton step before pairs are held
+    last: wp.array[wp.vec3]  # the same of the Newton step before
 
 
 @functools.cache

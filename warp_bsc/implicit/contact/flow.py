@@ -101,17 +101,7 @@ class Place:
 
 @wp.struct
 class Problem:
-    """What Newton steps read and write.
-
-    Attributes:
-        vertices_at_planes: Vertices that infinite planes may stop, 0 if there are none.
-        parts: Threads that share rows and blocks.
-        turns: Rows that they share, one after the other, no more than they are.
-        grows: 1 if the host can enlarge the buffers of contacts, outside of CUDA graphs.
-        least_change: Change by which no unknown changes any more where a step ends [m].
-        far_change: Change by which one that changes still is far from its end [m].
-        max_steps, max_late_steps: Newton steps of a step at most, and while something that a program moves comes.
-    """
+    """What Newton steps read and write."""
 
     motion: Motion
     planes: MovingPlanes
@@ -129,14 +119,14 @@ class Problem:
     progress: Progress
     flow: Flow
     worlds: Worlds
-    vertices_at_planes: int
-    parts: int
-    turns: int
-    grows: int
-    least_change: float
-    far_change: float
-    max_steps: int
-    max_late_steps: int
+    vertices_at_planes: int  # vertices that infinite planes may stop, 0 if there are none
+    parts: int  # threads that share rows and blocks
+    turns: int  # rows that they share, one after the other, no more than they are
+    grows: int  # 1 if the host can enlarge the buffers of contacts, outside of CUDA graphs
+    least_change: float  # change by which no unknown changes any more where a step ends [m]
+    far_change: float  # change by which one that changes still is far from its end [m]
+    max_steps: int  # Newton steps of a step at most
+    max_late_steps: int  # the same while something that a program moves comes
 
 
 @wp.func

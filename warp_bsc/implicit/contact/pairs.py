@@ -94,45 +94,28 @@ NO_FACE = wp.constant(2**31 - 1)
 
 @wp.struct
 class Trial:
-    """Positions, and displacements from them, of which each world takes a share.
+    """Positions, and displacements from them, of which each world takes a share."""
 
-    Attributes:
-        x: Positions of vertices [m].
-        displaced: Displacements [m].
-        share: Share of its displacement that a vertex takes of what its world takes.
-        cut: 1 of each holder whose share the last truncation made smaller.
-        holder: Vertex whose share each vertex takes: itself, or the first of its body.
-        bend: How far arcs of vertices leave their displacements at most, by t (1 - t) at a share t of them [m].
-        exact: Positions without rounding, which for friction is a large part of the way [m].
-        moved: The same after displacements; where a Newton step begins, before them.
-        path: Positions after the Newton steps of the step: the straight way to the first is free, shape [8, particles];
-            the last are those after the last of more.
-        goal: Where inertia leads [m].
-        lower, upper: Boxes within which the candidates are all pairs that may come near each other [m].
-        margin: By how much these are larger than ways [m].
-        limit: Share of its displacement before each vertex meets something.
-        origin: Where vertices started the step, those that touched a shape a little beside it [m].
-        touched: First face of a shape that each particle touches at the start; :data:`NO_FACE` for none.
-        any_touches: 1 if one does, shape [1].
-    """
-
-    x: wp.array[wp.vec3]
-    displaced: wp.array[wp.vec3]
-    share: wp.array[float]
-    cut: wp.array[int]
-    holder: wp.array[int]
+    x: wp.array[wp.vec3]  # positions of vertices [m]
+    displaced: wp.array[wp.vec3]  # displacements [m]
+    share: wp.array[float]  # share of its displacement that a vertex takes of what its world takes
+    cut: wp.array[int]  # 1 of each holder whose share the last truncation made smaller
+    holder: wp.array[int]  # vertex whose share each vertex takes: itself, or the first of its body
+    # how far arcs of vertices leave their displacements at most, by t (1 - t) at a share t of them [m]
     bend: wp.array[float]
-    exact: wp.array[wp.vec3d]
-    moved: wp.array[wp.vec3d]
+    exact: wp.array[wp.vec3d]  # positions without rounding, which for friction is a large part of the way [m]
+    moved: wp.array[wp.vec3d]  # the same after displacements; where a Newton step begins, before them
+    # positions after the Newton steps of the step: the straight way to the first is free, shape [8, particles]; the
+    # last are those after the last of more
     path: wp.array2d[wp.vec3]
-    goal: wp.array[wp.vec3]
-    lower: wp.array[wp.vec3]
-    upper: wp.array[wp.vec3]
-    margin: wp.array[float]
-    limit: wp.array[float]
-    origin: wp.array[wp.vec3]
-    touched: wp.array[int]
-    any_touches: wp.array[int]
+    goal: wp.array[wp.vec3]  # where inertia leads [m]
+    lower: wp.array[wp.vec3]  # of boxes within which the candidates are all pairs that may come near each other [m]
+    upper: wp.array[wp.vec3]  # of these boxes [m]
+    margin: wp.array[float]  # by how much these are larger than ways [m]
+    limit: wp.array[float]  # share of its displacement before each vertex meets something
+    origin: wp.array[wp.vec3]  # where vertices started the step, those that touched a shape a little beside it [m]
+    touched: wp.array[int]  # first face of a shape that each particle touches at the start; :data:`NO_FACE` for none
+    any_touches: wp.array[int]  # 1 if one does, shape [1]
 
 
 @wp.func

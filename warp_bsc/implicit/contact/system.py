@@ -32,93 +32,53 @@ class Unknowns:
 
 @wp.struct
 class Worlds:
-    """What is in each world; the first of it in each, and the end of the last.
+    """What is in each world; the first of it in each, and the end of the last."""
 
-    Attributes:
-        vertices, first_vertex: Vertices, those that are solved for, and all particles, first.
-        first_given: First of the others in each.
-        elements, first_element: Elements.
-    """
-
-    vertices: wp.array[int]
-    first_vertex: wp.array[int]
-    first_given: wp.array[int]
-    elements: wp.array[int]
-    first_element: wp.array[int]
+    vertices: wp.array[int]  # those that are solved for, and all particles, come first in a world
+    first_vertex: wp.array[int]  # of each world
+    first_given: wp.array[int]  # first of the others in each
+    elements: wp.array[int]  # world by world
+    first_element: wp.array[int]  # of each world
 
 
 @wp.struct
 class Progress:
-    """How far each world is with its step.
+    """How far each world is with its step."""
 
-    Attributes:
-        active: 1 while a world takes another Newton step, shape [worlds], like all that follow.
-        solving: 1 of a world for which a solve comes next.
-        steps: Newton steps so far.
-        scale: Share of the displacements that is taken.
-        scale_before: The same in the Newton step before.
-        damping: Share that is taken at most.
-        square, product: Of the displacements with themselves, and with those of the Newton step before, in units.
-        square_before: Square of the latter, in units.
-        bound: Share of the displacements before two elements meet.
-        searches: 1 while the share is halved, as the energy has risen.
-        energy: Energy at the positions, in units.
-        reached: Energy where the Newton step before ended, in units.
-        trial: Energy at the displaced positions, in units.
-        uncut: The same, before displacements of single vertices are cut.
-        cuts: 1 if those are cut.
-        change: Largest displacement of an unknown in the Newton step [m].
-        before: The same in the one before it, as far as it was taken, -1 if it was not [m].
-        way: How far a vertex has been, or is led by the displacements, from where it was at the start of the step [m].
-        way_before: The same in the step before.
-        fastest: Longest way of a particle in the step as predicted, without this step's gravity [m].
-        longest: Longest displacement of a vertex in the Newton step, or more [m].
-        given_way: The same of what a program moves.
-        remaining: Largest way of what a program moves that is left [m].
-        held: 1 if pairs are held in the solve.
-        late: Newton steps that began before what a program moves had arrived, but for the first of them.
-        fall: How far gravity moves what is at rest in the step [m].
-        driven: Largest way of what a program moves in the step [m].
-        given_moves: 1 if something moves in the step that is not solved for.
-        leaves: 1 if a vertex leaves its box.
-        plane_share: Share of their ways that infinite planes have gone.
-        whole: Share that is taken without cuts of single vertices.
-        goes_back: 1 if the step ends at an earlier Newton step, :attr:`place`.
-    """
-
-    active: wp.array[int]
-    solving: wp.array[int]
-    steps: wp.array[int]
-    scale: wp.array[float]
-    scale_before: wp.array[float]
-    damping: wp.array[float]
-    square: wp.array[wp.int64]
-    square_before: wp.array[wp.int64]
-    product: wp.array[wp.int64]
-    bound: wp.array[float]
-    searches: wp.array[int]
-    energy: wp.array[wp.int64]
-    reached: wp.array[wp.int64]
-    trial: wp.array[wp.int64]
-    uncut: wp.array[wp.int64]
-    cuts: wp.array[int]
-    change: wp.array[float]
-    before: wp.array[float]
+    active: wp.array[int]  # 1 while a world takes another Newton step, shape [worlds], like all that follow
+    solving: wp.array[int]  # 1 of a world for which a solve comes next
+    steps: wp.array[int]  # Newton steps so far
+    scale: wp.array[float]  # share of the displacements that is taken
+    scale_before: wp.array[float]  # the same in the Newton step before
+    damping: wp.array[float]  # share that is taken at most
+    square: wp.array[wp.int64]  # of the displacements, in units
+    square_before: wp.array[wp.int64]  # of those of the Newton step before, in units
+    product: wp.array[wp.int64]  # of both, in units
+    bound: wp.array[float]  # share of the displacements before two elements meet
+    searches: wp.array[int]  # 1 while the share is halved, as the energy has risen
+    energy: wp.array[wp.int64]  # energy at the positions, in units
+    reached: wp.array[wp.int64]  # energy where the Newton step before ended, in units
+    trial: wp.array[wp.int64]  # energy at the displaced positions, in units
+    uncut: wp.array[wp.int64]  # the same, before displacements of single vertices are cut
+    cuts: wp.array[int]  # 1 if those are cut
+    change: wp.array[float]  # largest displacement of an unknown in the Newton step [m]
+    before: wp.array[float]  # the same in the one before it, as far as it was taken, -1 if it was not [m]
+    # how far a vertex has been, or is led by the displacements, from where it was at the start of the step [m]
     way: wp.array[float]
-    way_before: wp.array[float]
-    fastest: wp.array[float]
-    longest: wp.array[float]
-    given_way: wp.array[float]
-    remaining: wp.array[float]
-    held: wp.array[int]
-    late: wp.array[int]
-    fall: wp.array[float]
-    driven: wp.array[float]
-    given_moves: wp.array[int]
-    leaves: wp.array[int]
-    plane_share: wp.array[float]
-    whole: wp.array[float]
-    goes_back: wp.array[int]
+    way_before: wp.array[float]  # the same in the step before
+    fastest: wp.array[float]  # longest way of a particle in the step as predicted, without this step's gravity [m]
+    longest: wp.array[float]  # longest displacement of a vertex in the Newton step, or more [m]
+    given_way: wp.array[float]  # the same of what a program moves
+    remaining: wp.array[float]  # largest way of what a program moves that is left [m]
+    held: wp.array[int]  # 1 if pairs are held in the solve
+    late: wp.array[int]  # Newton steps that began before what a program moves had arrived, but for the first of them
+    fall: wp.array[float]  # how far gravity moves what is at rest in the step [m]
+    driven: wp.array[float]  # largest way of what a program moves in the step [m]
+    given_moves: wp.array[int]  # 1 if something moves in the step that is not solved for
+    leaves: wp.array[int]  # 1 if a vertex leaves its box
+    plane_share: wp.array[float]  # share of their ways that infinite planes have gone
+    whole: wp.array[float]  # share that is taken without cuts of single vertices
+    goes_back: wp.array[int]  # 1 if the step ends at an earlier Newton step, ``place``
     place: wp.array[int]
 
 
@@ -148,73 +108,47 @@ class Contacts:
     """Pairs of elements that are near each other, and particles near planes, with their closest points as fixed.
 
     The energy of one, as a function of the vector between the closest points, has ``gradient`` and ``hessian``.
-
-    Attributes:
-        count: Number of contacts of each world; those that did not fit are counted, but are not there.
-        start: Where those of each world begin, and the end of all room.
-        corners: Vertices; of a particle at a plane, four times the particle.
-        unknowns: The ``of_vertex`` of the corners.
-        weights: Of the vertices in the vector from the second closest point to the first; all 0 of what is merged.
-        normal: Unit vector from the second closest point to the first.
-        load: Force that pushes them apart [N].
-        limit: Force of friction at most [N].
-        gradient: [N].
-        hessian: Positive semidefinite [N/m].
-        key: Number of the pair, by which contacts of an unknown are ordered.
-        couples: 1 of a contact of two elements that are both solved for, or of a body. The blocks of others, between
-            vertices of one element, are parts of the rows of elements.
-        feature: Vertices of a contact of two vertices, or of one and an edge; -1 of others.
-        parts: Threads that share a contact, and buckets of each hash of vertices.
-        first_bucket: First hash of each world, and the end of the last.
-        bucket: 1 more than the first contact there, 0 for none; ``next`` has those that follow.
-        listed: Number of entries of each world.
-        first, several, middle, end: First entry of each unknown, the first of those whose contacts have other unknowns
-            as well, the first of those that couple, and the end of them.
-        entries: Contact and place of the vertex in it, as four times the contact plus the place.
-        entries_of_each: Entries for which there is room, by contact.
-        unsorted, row, order: The same in any order, its unknown, and the number by which it is ordered.
-        coupled: Contacts that couple, those of a world from ``coupled_first`` to ``coupled_end``.
-        coupled_unknowns: Of each of those, the ``of_vertex`` of its corners, -1 of corners without weight.
-        place_in_coupled: Place of each contact that couples among those of its world.
-        pulled, entry_weight: The same, and its weight, of each entry of one that couples.
-        pull: Product of the Hessian of each of ``coupled`` with a displacement [N].
     """
 
-    count: wp.array[int]
-    start: wp.array[int]
-    corners: wp.array[wp.vec4i]
-    unknowns: wp.array[wp.vec4i]
+    count: wp.array[int]  # number of contacts of each world; those that did not fit are counted, but are not there
+    start: wp.array[int]  # where those of each world begin, and the end of all room
+    corners: wp.array[wp.vec4i]  # vertices; of a particle at a plane, four times the particle
+    unknowns: wp.array[wp.vec4i]  # the ``of_vertex`` of the corners
+    # of the vertices in the vector from the second closest point to the first; all 0 of what is merged
     weights: wp.array[wp.vec4]
-    normal: wp.array[wp.vec3]
-    load: wp.array[float]
-    limit: wp.array[float]
-    gradient: wp.array[wp.vec3]
-    hessian: wp.array[mat34]
-    key: wp.array[wp.int64]
+    normal: wp.array[wp.vec3]  # unit vector from the second closest point to the first
+    load: wp.array[float]  # force that pushes them apart [N]
+    limit: wp.array[float]  # force of friction at most [N]
+    gradient: wp.array[wp.vec3]  # [N]
+    hessian: wp.array[mat34]  # positive semidefinite [N/m]
+    key: wp.array[wp.int64]  # number of the pair, by which contacts of an unknown are ordered
+    # 1 of a contact of two elements that are both solved for, or of a body. The blocks of others, between vertices of
+    # one element, are parts of the rows of elements.
     couples: wp.array[int]
-    feature: wp.array[wp.vec3i]
-    parts: int
-    first_bucket: wp.array[int]
-    bucket: wp.array[int]
+    feature: wp.array[wp.vec3i]  # vertices of a contact of two vertices, or of one and an edge; -1 of others
+    parts: int  # threads that share a contact, and buckets of each hash of vertices
+    first_bucket: wp.array[int]  # first hash of each world, and the end of the last
+    bucket: wp.array[int]  # 1 more than the first contact there, 0 for none; ``next`` has those that follow
     next: wp.array[int]
-    listed: wp.array[int]
-    first: wp.array[int]
-    several: wp.array[int]
-    middle: wp.array[int]
-    end: wp.array[int]
-    entries: wp.array[int]
-    entries_of_each: int
-    unsorted: wp.array[int]
-    row: wp.array[int]
-    order: wp.array[wp.int64]
-    coupled: wp.array[int]
+    listed: wp.array[int]  # number of entries of each world
+    first: wp.array[int]  # first entry of each unknown
+    several: wp.array[int]  # the first of those whose contacts have other unknowns as well
+    middle: wp.array[int]  # the first of those that couple
+    end: wp.array[int]  # the end of them
+    entries: wp.array[int]  # contact and place of the vertex in it, as four times the contact plus the place
+    entries_of_each: int  # entries for which there is room, by contact
+    unsorted: wp.array[int]  # entries in any order
+    row: wp.array[int]  # unknown of each of these
+    order: wp.array[wp.int64]  # number by which each of these is ordered
+    coupled: wp.array[int]  # contacts that couple, those of a world from ``coupled_first`` to ``coupled_end``
     coupled_first: wp.array[int]
     coupled_end: wp.array[int]
+    # of each of those, the ``of_vertex`` of its corners, -1 of corners without weight
     coupled_unknowns: wp.array[wp.vec4i]
-    place_in_coupled: wp.array[int]
-    pulled: wp.array[int]
-    entry_weight: wp.array[float]
-    pull: wp.array[wp.vec3]
+    place_in_coupled: wp.array[int]  # place of each contact that couples among those of its world
+    pulled: wp.array[int]  # the same of each entry of one that couples
+    entry_weight: wp.array[float]  # weight of each of these
+    pull: wp.array[wp.vec3]  # product of the Hessian of each of ``coupled`` with a displacement [N]
 
 
 AT_PLANE = wp.constant(8)

@@ -16,18 +16,14 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Derivatives:
-    """What :func:`find_derivatives` computes.
+    """What :func:`find_derivatives` computes."""
 
-    Attributes:
-        gradient: Of each corner of each element [N], shape [corners].
-        block: Hessians of each two corners of each element but those of bending, row by row [N/m], shape [blocks],
-            each row with a fourth number without meaning, so that a GPU reads and writes it at once.
-        turn: Of each corner of each element of bending [sqrt(N/m)], shape [4 count]: the outer products of those of
-            two corners are blocks of its Hessian, the fourth number is without meaning.
-    """
-
-    gradient: wp.array[wp.vec3]
+    gradient: wp.array[wp.vec3]  # of each corner of each element [N], shape [corners]
+    # hessians of each two corners of each element but those of bending, row by row [N/m], shape [blocks], each row with
+    # a fourth number without meaning, so that a GPU reads and writes it at once
     block: wp.array[mat34]
+    # of each corner of each element of bending [sqrt(N/m)], shape [4 count]: the outer products of those of two corners
+    # are blocks of its Hessian, the fourth number is without meaning
     turn: wp.array[wp.vec4]
 
 

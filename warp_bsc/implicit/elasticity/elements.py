@@ -27,15 +27,10 @@ _FIRST_CORNER, _FIRST_BLOCK = wp.constant(4), wp.constant(8)
 
 @wp.struct
 class Elements:
-    """The elements of a model. They, their corners and their blocks are numbered, one kind behind the other.
+    """The elements of a model. They, their corners and their blocks are numbered, one kind behind the other."""
 
-    Attributes:
-        first: First element of each kind, then first corner, then first block.
-        tri_indices: Particles of triangles, and so on as in ``newton.Model``.
-    """
-
-    first: wp.array[int]
-    tri_indices: wp.array2d[int]
+    first: wp.array[int]  # first element of each kind, then first corner, then first block
+    tri_indices: wp.array2d[int]  # particles of triangles, and so on as in ``newton.Model``
     tri_poses: wp.array[wp.mat22]
     tri_areas: wp.array[float]
     tri_materials: wp.array2d[float]

@@ -184,7 +184,7 @@ def _find_nearest(work):
 
     find()
     while not work.device.is_capturing:
-        if detector.counters.read().face_pairs > MOST_PAIRS_PER_FACE * len(work.mesh.cells):
+        if detector.counters.read().face_pairs > min(MOST_PAIRS_PER_FACE * len(work.mesh.cells), 2**30):
             return False
         if not detector.grow():
             break
