@@ -37,15 +37,10 @@ _OUTPUTS = ("--json", "--figure")
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """A run of which there may be no measurement; other fields say which one it is.
+    """A run of which there may be no measurement; other fields say which one it is."""
 
-    Attributes:
-        measured: The measurement; None if there is none.
-        problem: Why there is no measurement; None if there is one.
-    """
-
-    measured: Any = None
-    problem: str | None = None
+    measured: Any = None  # the measurement; None if there is none
+    problem: str | None = None  # why there is no measurement; None if there is one
 
 
 @contextlib.contextmanager

@@ -12,25 +12,18 @@ LONGEST = 30
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a table: the value that it shows of each row, and how.
+    """A column of a table: the value that it shows of each row, and how."""
 
-    Attributes:
-        header: Its header, shown as it is: markup would take "[s]" for a style.
-        value: Key, number or attribute of a row, with dots for one of that; or a function of a row.
-        format: Format specification of the value, or a function that returns its text; not of texts and None.
-        width: Least width on a terminal.
-        kind: Numbers are on the right and do not wrap, words are on the left and do not wrap, text may wrap.
-        title: Its header in pages, if that is another one.
-        page_format: Its format in pages, if that is another one.
-    """
-
-    header: str
+    header: str  # its header, shown as it is: markup would take "[s]" for a style
+    # key, number or attribute of a row, with dots for one of that; or a function of a row
     value: str | Callable[[Any], Any] = ""
+    # format specification of the value, or a function that returns its text; not of texts and None
     format: str | Callable[[Any], str] = ","
-    width: int | None = None
+    width: int | None = None  # least width on a terminal
+    # numbers are on the right and do not wrap, words are on the left and do not wrap, text may wrap
     kind: Literal["number", "word", "text"] = "number"
-    title: str | None = None
-    page_format: str | Callable[[Any], str] | None = None
+    title: str | None = None  # its header in pages, if that is another one
+    page_format: str | Callable[[Any], str] | None = None  # its format in pages, if that is another one
 
     def cell(self, row: Any, *, page: bool = False) -> str:
         """Returns the text of the cell in a row, in a page or on a terminal; empty in a row that is None."""
@@ -47,19 +40,13 @@ class Column:
 
 @dataclass(frozen=True)
 class Table:
-    """A table with its rows.
+    """A table with its rows."""
 
-    Attributes:
-        first: The column of the names of the rows, or its header.
-        columns: The other columns.
-        rows: The name of each row, and a value of which the columns show parts; None leaves them empty.
-        caption: A sentence below the table.
-    """
-
-    first: str | Column
-    columns: Sequence[Column]
+    first: str | Column  # the column of the names of the rows, or its header
+    columns: Sequence[Column]  # the other columns
+    # the name of each row, and a value of which the columns show parts; None leaves them empty
     rows: Iterable[tuple[str, Any]]
-    caption: str | None = None
+    caption: str | None = None  # a sentence below the table
 
 
 def _part(row: Any, name: str) -> Any:

@@ -113,8 +113,8 @@ PAIRS_PER_FACE, PAIRS_PER_STATIC_FACE = 96, 2
 """Capacity of the detector's queues on a GPU, for each face that can move, and for others, which have pairs with those
 alone: queues of a CUDA graph cannot grow. Four sheets of cloth that lie on each other have some 50, and up to 160 in a
 Newton step in which they land."""
-MOST_PAIRS_PER_FACE = 512
-"""Pairs of faces whose swept boxes overlap, for each face, up to which proximities are looked for on a GPU."""
+MOST_PAIRS_PER_FACE, MOST_FACE_PAIRS = 512, 2**30
+"""Pairs of faces whose swept boxes overlap, up to which a GPU looks for proximities: for each face, and all (8 GB)."""
 CANDIDATES_OF_CONTACT_IF_FEW = 32
 """Candidates for each contact for which there is room on a GPU where contacts are few, as behind a solver that leaves
 none."""

@@ -200,21 +200,14 @@ def _kernels(kind: PairKind, dtype: type):
 
 @dataclass(frozen=True)
 class Queries:
-    """Queries of one kind as pairs of a mesh's elements.
+    """Queries of one kind as pairs of a mesh's elements."""
 
-    Attributes:
-        kind: Kind of pair.
-        x0: Positions of the mesh at the start of the step, float32 or float64, shape [vertex_count, 3].
-        x1: Positions at its end, of the same type.
-        elements: Vertices of its faces (VERTEX_FACE) or edges (EDGE_EDGE), int32, shape [element_count, 3 or 2].
-        pairs: (vertex, face) or (edge, edge), no pair twice, int32, shape [n, 2].
-    """
-
-    kind: PairKind
-    x0: np.ndarray
-    x1: np.ndarray
+    kind: PairKind  # kind of pair
+    x0: np.ndarray  # positions of the mesh at the start of the step, float32 or float64, shape [vertex_count, 3]
+    x1: np.ndarray  # positions at its end, of the same type
+    # vertices of its faces (VERTEX_FACE) or edges (EDGE_EDGE), int32, shape [element_count, 3 or 2]
     elements: np.ndarray
-    pairs: np.ndarray
+    pairs: np.ndarray  # (vertex, face) or (edge, edge), no pair twice, int32, shape [n, 2]
 
     @classmethod
     def of_points(cls, kind: PairKind, points: np.ndarray) -> "Queries":

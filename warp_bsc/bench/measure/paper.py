@@ -34,23 +34,14 @@ _TURNS = 8  # of timing all methods
 
 @dataclass(frozen=True)
 class Effort:
-    """The amount of measurements.
+    """The amount of measurements."""
 
-    Attributes:
-        intervals: Number of intervals of a scene, evenly spaced.
-        queries: Largest number of queries of a scene.
-        sample: Number of queries of a scene that are checked although no method calls them a collision.
-        ipc_queries: Number of queries of a scene on which the IPC Toolkit is timed.
-        adversaries: Number of adversarial queries of each kind.
-        repeat: Number of repetitions.
-    """
-
-    intervals: int
-    queries: int
-    sample: int
-    ipc_queries: int
-    adversaries: int
-    repeat: int
+    intervals: int  # number of intervals of a scene, evenly spaced
+    queries: int  # largest number of queries of a scene
+    sample: int  # number of queries of a scene that are checked although no method calls them a collision
+    ipc_queries: int  # number of queries of a scene on which the IPC Toolkit is timed
+    adversaries: int  # number of adversarial queries of each kind
+    repeat: int  # number of repetitions
 
 
 FULL = Effort(intervals=8, queries=2**19, sample=20_000, ipc_queries=4000, adversaries=100_000, repeat=24)
@@ -60,17 +51,11 @@ QUICK = Effort(intervals=2, queries=2**15, sample=1000, ipc_queries=500, adversa
 
 @dataclass(frozen=True)
 class Place:
-    """A device, and the number of its cores, on which methods are timed.
+    """A device, and the number of its cores, on which methods are timed."""
 
-    Attributes:
-        device: Warp device.
-        cores: CPU cores, None on a GPU.
-        name: Name in tables.
-    """
-
-    device: wp.Device
-    cores: int | None
-    name: str
+    device: wp.Device  # Warp device
+    cores: int | None  # CPU cores, None on a GPU
+    name: str  # name in tables
 
     def limited(self) -> contextlib.AbstractContextManager:
         """Returns a context in which kernels run on one core if the place is that."""

@@ -33,27 +33,17 @@ WARM_UP = 2
 
 @dataclass(frozen=True)
 class Simulator:
-    """A simulator with its settings.
+    """A simulator with its settings."""
 
-    Attributes:
-        title: Its name for people.
-        rate: Steps a second.
-        settings: Its settings, and where they come from.
-        claims: What it says of penetration; None if nothing.
-        package: The distribution that it comes with.
-        solver: One of :data:`.response.SOLVERS`, or ``"implicit"``; None for one that is not for Newton.
-        has_self_contact: Whether VBD has contacts between particles of its own.
-        has_stage: Whether :class:`warp_bsc.SolverCCD` is behind the solver, or the solver is one itself.
-    """
-
-    title: str
-    rate: int
-    settings: str
-    claims: str | None = None
-    package: str = "newton"
+    title: str  # its name for people
+    rate: int  # steps a second
+    settings: str  # its settings, and where they come from
+    claims: str | None = None  # what it says of penetration; None if nothing
+    package: str = "newton"  # the distribution that it comes with
+    # one of :data:`.response.SOLVERS`, or ``"implicit"``; None for one that is not for Newton
     solver: str | None = None
-    has_self_contact: bool = False
-    has_stage: bool = False
+    has_self_contact: bool = False  # whether VBD has contacts between particles of its own
+    has_stage: bool = False  # whether :class:`warp_bsc.SolverCCD` is behind the solver, or the solver is one itself
 
 
 def _with_stage(inner: Simulator) -> Simulator:

@@ -78,30 +78,19 @@ _COSTS = (
 
 @dataclass(frozen=True)
 class RepairAttempt:
-    """A repair of a mesh.
+    """A repair of a mesh."""
 
-    Attributes:
-        hint: What it was told.
-        crossings: Edges that meet faces afterwards, each counted once a face.
-        certified: Whether the repair certifies that there are none.
-        largest_move: Largest distance of a vertex from the input, in median edge lengths of the input.
-        mean_move: Mean distance of the vertices that moved, in the same unit; 0 if none did.
-        strain: Largest change of the length of an edge, as a share of its length in the input.
-        seconds: Time of a second call with the same arguments, which makes its mesh from faces and has the positions
-            on the host [s].
-        reasons: Why crossings remain, each reason once.
-        toolkit_crosses: Whether the IPC Toolkit finds intersections afterwards; None if it is not installed.
-    """
-
-    hint: Hint
-    crossings: int
-    certified: bool
-    largest_move: float
-    mean_move: float
-    strain: float
+    hint: Hint  # what it was told
+    crossings: int  # edges that meet faces afterwards, each counted once a face
+    certified: bool  # whether the repair certifies that there are none
+    largest_move: float  # largest distance of a vertex from the input, in median edge lengths of the input
+    mean_move: float  # mean distance of the vertices that moved, in the same unit; 0 if none did
+    strain: float  # largest change of the length of an edge, as a share of its length in the input
+    # time of a second call with the same arguments, which makes its mesh from faces and has the positions on the host
+    # [s]
     seconds: float
-    reasons: tuple[str, ...]
-    toolkit_crosses: bool | None
+    reasons: tuple[str, ...]  # why crossings remain, each reason once
+    toolkit_crosses: bool | None  # whether the IPC Toolkit finds intersections afterwards; None if it is not installed
 
     @property
     def toolkit_agrees(self) -> bool | None:
@@ -111,25 +100,17 @@ class RepairAttempt:
 
 @dataclass(frozen=True)
 class RepairRun:
-    """The repairs of a mesh.
+    """The repairs of a mesh."""
 
-    Attributes:
-        kind: :data:`KNOWN_MESH`, :data:`FILE`, or the kind of random damage.
-        name: The name of a known mesh, the path of a file, or the number of random damage.
-        vertices: Number of vertices.
-        faces: Number of faces.
-        crossings: Edges that meet faces in the input, each counted once a face.
-        attempts: A repair without a hint; if it did not free the mesh, one with each hint that there is for it.
-        keeps_free: Whether the repair of positions that do not cross returned every bit: of those before the damage,
-            or of a file the repaired ones. None if there are none.
-    """
-
-    kind: str
-    name: str
-    vertices: int
-    faces: int
-    crossings: int
+    kind: str  # :data:`KNOWN_MESH`, :data:`FILE`, or the kind of random damage
+    name: str  # the name of a known mesh, the path of a file, or the number of random damage
+    vertices: int  # number of vertices
+    faces: int  # number of faces
+    crossings: int  # edges that meet faces in the input, each counted once a face
+    # a repair without a hint; if it did not free the mesh, one with each hint that there is for it
     attempts: tuple[RepairAttempt, ...]
+    # whether the repair of positions that do not cross returned every bit: of those before the damage, or of a file the
+    # repaired ones. None if there are none.
     keeps_free: bool | None
 
     def is_freed(self, *hints: Hint) -> bool:

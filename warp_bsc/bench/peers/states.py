@@ -17,17 +17,12 @@ class NotInstalled(Exception):
 
 @dataclass(frozen=True)
 class Trajectory:
-    """What a simulator made of a scene.
+    """What a simulator made of a scene."""
 
-    Attributes:
-        states: Positions of the particles at the start and after each step [m], each of shape [particle_count, 3].
-        milliseconds: Time of each step [ms].
-        uncertified_steps: Steps that the stage did not certify; None without a stage.
-    """
-
+    # positions of the particles at the start and after each step [m], each of shape [particle_count, 3]
     states: list[np.ndarray]
-    milliseconds: list[float]
-    uncertified_steps: int | None = None
+    milliseconds: list[float]  # time of each step [ms]
+    uncertified_steps: int | None = None  # steps that the stage did not certify; None without a stage
 
 
 @dataclass(frozen=True)

@@ -25,40 +25,26 @@ class NotRunnable(Exception):
 
 @dataclass(frozen=True)
 class Motion:
-    """What a program moves: kinematic bodies, which are the first of the model, and held particles.
+    """What a program moves: kinematic bodies, which are the first of the model, and held particles."""
 
-    Attributes:
-        poses: Poses of the bodies at a time [s], shape [body_count, 7]; None if there are none.
-        held: Numbers of the particles.
-        positions: Their positions at a time [m], shape [held_count, 3]; None if there are none.
-    """
-
+    # poses of the bodies at a time [s], shape [body_count, 7]; None if there are none
     poses: Callable[[float], np.ndarray] | None = None
-    held: tuple[int, ...] = ()
+    held: tuple[int, ...] = ()  # numbers of the particles
+    # their positions at a time [m], shape [held_count, 3]; None if there are none
     positions: Callable[[float], np.ndarray] | None = None
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A scene.
+    """A scene."""
 
-    Attributes:
-        model: The model.
-        seconds: Simulated time [s].
-        rate: Steps a second.
-        motion: What a program moves; None if nothing.
-        resets: Worlds that a program resets, by time [s].
-        stage_options: Arguments of the stage that the scene needs.
-        strands: Whether springs without faces are edges that collide.
-    """
-
-    model: newton.Model
-    seconds: float
-    rate: int = 60
-    motion: Motion | None = None
-    resets: dict[float, tuple[int, ...]] = field(default_factory=dict)
-    stage_options: dict[str, Any] = field(default_factory=dict)
-    strands: bool = False
+    model: newton.Model  # the model
+    seconds: float  # simulated time [s]
+    rate: int = 60  # steps a second
+    motion: Motion | None = None  # what a program moves; None if nothing
+    resets: dict[float, tuple[int, ...]] = field(default_factory=dict)  # worlds that a program resets, by time [s]
+    stage_options: dict[str, Any] = field(default_factory=dict)  # arguments of the stage that the scene needs
+    strands: bool = False  # whether springs without faces are edges that collide
 
 
 class SceneBuilder:

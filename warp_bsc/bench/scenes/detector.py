@@ -23,21 +23,13 @@ _MIN_TRIANGLES, _MAX_TRIANGLES = 1000, 20_000_000
 
 @dataclass(frozen=True)
 class BenchmarkScene:
-    """A mesh and one step of its motion.
+    """A mesh and one step of its motion."""
 
-    Attributes:
-        name: The name that the user gave, and the number of worlds if there are many.
-        faces: Vertex indices, int32, shape [face_count, 3].
-        x0: Positions at the start of the step, float32 or float64, shape [vertex_count, 3].
-        x1: Positions at its end, of the same type.
-        world: World of each vertex, int32, shape [vertex_count]; None if all are in one.
-    """
-
-    name: str
-    faces: np.ndarray
-    x0: np.ndarray
-    x1: np.ndarray
-    world: np.ndarray | None = None
+    name: str  # the name that the user gave, and the number of worlds if there are many
+    faces: np.ndarray  # vertex indices, int32, shape [face_count, 3]
+    x0: np.ndarray  # positions at the start of the step, float32 or float64, shape [vertex_count, 3]
+    x1: np.ndarray  # positions at its end, of the same type
+    world: np.ndarray | None = None  # world of each vertex, int32, shape [vertex_count]; None if all are in one
 
     def in_worlds(self, count: int) -> "BenchmarkScene":
         """Returns the scene in a number of worlds, which do not collide with each other; in one, the scene itself.

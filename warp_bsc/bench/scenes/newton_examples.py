@@ -28,23 +28,14 @@ _NEEDS = (
 
 @dataclass(frozen=True)
 class NewtonExample:
-    """An example of Newton.
+    """An example of Newton."""
 
-    Attributes:
-        name: Its name, as ``python -m newton.examples`` takes it.
-        module: The module, which runs the example if it is the main one.
-        options: Options of the example itself.
-        deformable: Whether its source adds cloth or soft bodies to a model.
-        downloads: Names of the assets that it downloads, "" for one that the source does not name.
-        missing: Packages that it imports and that are not installed.
-    """
-
-    name: str
-    module: str
-    options: tuple[str, ...] = ()
-    deformable: bool = True
-    downloads: tuple[str, ...] = ()
-    missing: tuple[str, ...] = ()
+    name: str  # its name, as ``python -m newton.examples`` takes it
+    module: str  # the module, which runs the example if it is the main one
+    options: tuple[str, ...] = ()  # options of the example itself
+    deformable: bool = True  # whether its source adds cloth or soft bodies to a model
+    downloads: tuple[str, ...] = ()  # names of the assets that it downloads, "" for one that the source does not name
+    missing: tuple[str, ...] = ()  # packages that it imports and that are not installed
 
     @property
     def title(self) -> str:

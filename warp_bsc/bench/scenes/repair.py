@@ -12,22 +12,15 @@ from .mesh_files import read_mesh
 
 @dataclass(frozen=True, eq=False)
 class TangledMesh:
-    """A mesh whose positions cross, or may cross.
+    """A mesh whose positions cross, or may cross."""
 
-    Attributes:
-        faces: Vertex indices, int, shape [face_count, 3].
-        x: Positions that cross, float64, shape [vertex_count, 3].
-        free: Positions that do not cross, such as those before the damage, float64, shape [vertex_count, 3]; None if
-            there are none.
-        fixed: Vertices that must stay, bool, shape [vertex_count].
-        sheet: Sheet of each vertex from inside to outside, -1 for none, int, shape [vertex_count].
-    """
-
-    faces: np.ndarray
-    x: np.ndarray
+    faces: np.ndarray  # vertex indices, int, shape [face_count, 3]
+    x: np.ndarray  # positions that cross, float64, shape [vertex_count, 3]
+    # positions that do not cross, such as those before the damage, float64, shape [vertex_count, 3]; None if there are
+    # none
     free: np.ndarray | None
-    fixed: np.ndarray
-    sheet: np.ndarray
+    fixed: np.ndarray  # vertices that must stay, bool, shape [vertex_count]
+    sheet: np.ndarray  # sheet of each vertex from inside to outside, -1 for none, int, shape [vertex_count]
 
 
 _Surface = tuple[np.ndarray, np.ndarray]

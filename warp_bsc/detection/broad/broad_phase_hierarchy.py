@@ -138,9 +138,9 @@ class BroadPhaseHierarchy:
         self.pair_faces(x0, x1, changed, keep_separated, *launches)
 
     def pair_elements_again(self, x0: wp.array, x1: wp.array, *out: wp.array) -> None:
-        """Enqueues as with ``keep_separated``, after a run with it whose paths have those of all vertices in them.
+        """Enqueues as with ``keep_separated``, after a run with it whose paths contain those of now, axis by axis.
 
-        The pairs of faces of that run have all that is sought; only a large mesh is traversed again.
+        All that is sought is then among the pairs of faces of that run; only a large mesh is traversed again.
         """
         if len(self._part_counts) > 1:
             self.pair_elements(x0, x1, *out, keep_separated=True)
@@ -171,7 +171,7 @@ class BroadPhaseHierarchy:
                 launch(box_parents, WIDTH * len(parents.boxes), inputs=[children, parents], **options)
 
     def _fit_faces(self, x0, x1, changed, *, rows_only=False):
-        """Writes the corners and the boxes of faces; with ``rows_only`` no boxes, which without a padding are apart."""
+        """Writes the corners and the boxes of faces; with ``rows_only`` no boxes, unless one kernel writes both."""
         tree, options = self.hierarchy, {"device": self._device, "record_tape": False}
         if not self.is_padded or self._not_finite is not None:
             inputs, outputs = [x0, x1, self._checked], [None if self.is_padded else tree.corners, self._not_finite]

@@ -90,7 +90,7 @@ class BroadPhaseSimd:
             launch(round_kernel(x0.dtype), self._vertex_count, inputs=inputs, outputs=outputs, **options)
 
     def pair_elements_again(self, x0: wp.array, x1: wp.array, *out: wp.array) -> None:
-        """Enqueues as with ``keep_separated``."""
+        """Enqueues as with ``keep_separated``, in a run of its own."""
         self.pair_elements(x0, x1, *out, keep_separated=True)
 
     def pair_vertices_with_faces(self, counts: wp.array, pairs: wp.array) -> None:

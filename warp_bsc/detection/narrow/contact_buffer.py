@@ -91,8 +91,8 @@ def contacts_from_host(contacts: HostContacts, device: wp.Device) -> ContactBuff
 class ContactRows:
     """The first rows of a buffer: the contacts of one kind of pair in a result."""
 
-    buffer: ContactBuffer  # the buffer
-    count: int  # number of rows
+    buffer: ContactBuffer
+    count: int  # of rows
 
     def read(self) -> HostContacts:
         """Returns copies of the contacts; synchronizes with the device."""

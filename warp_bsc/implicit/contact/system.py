@@ -143,7 +143,7 @@ class Contacts:
     coupled: wp.array[int]  # contacts that couple, those of a world from ``coupled_first`` to ``coupled_end``
     coupled_first: wp.array[int]
     coupled_end: wp.array[int]
-    # of each of those, the ``of_vertex`` of its corners, -1 of corners without weight
+    # of each contact that couples, the ``of_vertex`` of its corners, -1 of corners without weight
     coupled_unknowns: wp.array[wp.vec4i]
     place_in_coupled: wp.array[int]  # place of each contact that couples among those of its world
     pulled: wp.array[int]  # the same of each entry of one that couples

@@ -13,7 +13,7 @@ from ..state.status import Loop, SolveStatus
 from ..state.structs import ContactKind, Pace, Step, constraint_count
 from ..state.vectors import ZERO, corners_of
 from ..state.workspace import Workspace
-from ..tuning import MOST_PAIRS_PER_FACE, REACH, RESTING_PATH
+from ..tuning import MOST_FACE_PAIRS, MOST_PAIRS_PER_FACE, REACH, RESTING_PATH
 from . import constraints
 from .closest_points import closest_vector
 from .occluders import clip_paths, find_nearest_in_queue, is_behind, nearest_among_faces_kernel
@@ -184,7 +184,7 @@ def _find_nearest(work):
 
     find()
     while not work.device.is_capturing:
-        if detector.counters.read().face_pairs > min(MOST_PAIRS_PER_FACE * len(work.mesh.cells), 2**30):
+        if detector.counters.read().face_pairs > min(MOST_PAIRS_PER_FACE * len(work.mesh.cells), MOST_FACE_PAIRS):
             return False
         if not detector.grow():
             break

@@ -48,7 +48,7 @@ def _marks(step: Step, vertex: int, is_particle: bool, responds: bool) -> int:
 def merge_step(step: Step, status: SolveStatus, particle_count: int, responds: bool, first: bool, out: StepResults):
     """Adds what a step, or a substep, did to the results, in place of those of the last step if it is the ``first``."""
     i = wp.tid()
-    if i == 0:  # the next one counts crossings at its start, but for a certified motion of what did not cross
+    if i == 0:  # the next one counts crossings at its start, unless nothing crossed, and this motion is certified
         results = status.results
         unchanged = is_certified(results) and results[Result.CROSSINGS] == 0 and results[Result.EXCLUDED] == 0
         status.loop[Loop.RECOUNT] = wp.where(unchanged, 0, 1)
