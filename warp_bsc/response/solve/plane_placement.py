@@ -80,13 +80,16 @@ def _side(
     for j in range(begin, end):
         vertex = corners[j]
         inverse_mass = wp.float64(inverse_mass_of(step.motion, vertex))
-        wanted = step.vertices.x1[vertex]
-        reached = step.motion.x0[vertex]
+        wanted, reached = wp.vec3(), wp.vec3()
         if inverse_mass == ZERO:
-            reached = wanted
+            wanted = step.vertices.x1[vertex]
+            reached = step.vertices.x1[vertex]
         elif planes.placed[vertex] != NOT_PLACED:
             wanted = planes.wanted[vertex]
             reached = planes.reached[vertex]
+        else:
+            wanted = step.vertices.x1[vertex]
+            reached = step.motion.x0[vertex]
         height = wp.dot(normal, to_double(reached)) - half
         side.reached = wp.min(side.reached, height)
         side.wanted = wp.min(side.wanted, wp.dot(normal, to_double(wanted)) - half)
