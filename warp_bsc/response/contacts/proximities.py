@@ -9,6 +9,7 @@ from ...kernels.closest import weights_across
 from ...kernels.pipeline.queues import has_overflowed
 from ...kernels.polynomials import EDGE_EDGE
 from ..schedule import divides_after, projects_now
+from ..state.cluster import BLOCK
 from ..state.status import Loop, SolveStatus
 from ..state.structs import ContactKind, Pace, Step, constraint_count
 from ..state.vectors import ZERO, corners_of
@@ -84,7 +85,7 @@ def _consider(
     _add_proximity(step, kind, pair, corners, weights, normal, distance, status)
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=(BLOCK, 2))
 def collect_proximities(
     step: Step,
     vertex_face: PairQueue,

@@ -92,7 +92,7 @@ def find_body_shares(step: Step, dividing: DividingPlanes, status: SolveStatus):
     share = ONE
     divides, complete = has_planes(dividing, vertex)
     if divides:
-        share, _above = share_of_path(dividing, vertex, to_double(motion.x0[vertex]), to_double(vertices.x1[vertex]))
+        share = share_of_path(dividing, vertex, to_double(motion.x0[vertex]), to_double(vertices.x1[vertex]))
     if not complete:
         share = wp.min(share, SHARE_OF_PATH * first_contact.contact_time(packed))
     if not complete or first_contact.contact_kind(packed) == ContactKind.NONE:

@@ -81,15 +81,12 @@ def _side(
         vertex = corners[j]
         inverse_mass = wp.float64(inverse_mass_of(step.motion, vertex))
         wanted, reached = wp.vec3(), wp.vec3()
-        if inverse_mass == ZERO:
+        if inverse_mass == ZERO or planes.placed[vertex] == NOT_PLACED:
             wanted = step.vertices.x1[vertex]
-            reached = step.vertices.x1[vertex]
-        elif planes.placed[vertex] != NOT_PLACED:
+            reached = wp.where(inverse_mass == ZERO, wanted, step.motion.x0[vertex])
+        else:
             wanted = planes.wanted[vertex]
             reached = planes.reached[vertex]
-        else:
-            wanted = step.vertices.x1[vertex]
-            reached = step.motion.x0[vertex]
         height = wp.dot(normal, to_double(reached)) - half
         side.reached = wp.min(side.reached, height)
         side.wanted = wp.min(side.wanted, wp.dot(normal, to_double(wanted)) - half)
@@ -102,7 +99,6 @@ def _side(
 
 @wp.func
 def _place_plane(step: Step, planes: DividingPlanes, status: SolveStatus, plane: int):
-    loop = status.loop
     if planes.vertices[plane][3] < 0:
         return
     corners = planes.vertices[plane]
@@ -114,7 +110,7 @@ def _place_plane(step: Step, planes: DividingPlanes, status: SolveStatus, plane:
         half = planes.half[plane]
     above = _side(step, planes, corners, 0, split, normal, half)
     below = _side(step, planes, corners, split, 4, -normal, half)
-    if above.rests and below.rests and loop[Loop.PASS] > 1:  # if read too early, it is placed for nothing
+    if above.rests and below.rests and status.loop[Loop.PASS] > 1:  # if read too early, it is placed for nothing
         return
     start = wp.min(planes.distance[plane], FAR_APART * step.separation)
     margin = wp.where(start < CLOSE_TOGETHER * step.separation, CLOSE_MARGIN, MARGIN) * start
@@ -181,7 +177,7 @@ def _move_to_sides(step: Step, planes: DividingPlanes, tolerance: wp.float64, st
         status.loop[Loop.MORE_PASSES] = 1
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=(BLOCK, 2))
 def move_to_sides(step: Step, planes: DividingPlanes, tolerance: wp.float64, status: SolveStatus):
     """Moves each particle as near to where it wants to end as its planes let it come."""
     _move_to_sides(step, planes, tolerance, status, wp.tid())

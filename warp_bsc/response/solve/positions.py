@@ -98,7 +98,7 @@ def _project_constraint(step: Step, status: SolveStatus, sweep: int, place: int)
     sweeps.add_delta(step, i, new - old, step.motion.x1, vertices.particle_delta_x, vertices.bodies.delta_x)
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=(BLOCK, 2))
 def project_positions(step: Step, status: SolveStatus, threads: int):
     """Updates the position multipliers of the active set, in one Jacobi sweep."""
     for place in range(wp.tid(), int(step.constraints.active_count[0]), threads):

@@ -101,7 +101,7 @@ def _project_constraint(step: Step, sweep: int, place: int):
     sweeps.add_delta(step, i, new - old, vertices.x1, vertices.particle_delta_v, vertices.bodies.delta_v)
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=(BLOCK, 2))
 def project_velocities(step: Step, status: SolveStatus, threads: int):
     """Updates the velocity multipliers of the active set, in one Jacobi sweep."""
     for place in range(wp.tid(), int(step.constraints.active_count[0]), threads):

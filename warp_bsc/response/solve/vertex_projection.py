@@ -22,8 +22,6 @@ _ROUNDING = wp.constant(wp.float64(1.0e-6))
 """Share by which a path to the nearest point may exceed the one to a point that is as near."""
 _SMALLEST = wp.constant(float(2.0**-149))
 """The smallest number in single precision."""
-_HALF_ULP = wp.constant(wp.float64(2.0**-23))
-"""More than what rounding to single precision changes, as a share of a number."""
 
 
 @wp.func
@@ -84,12 +82,11 @@ def _steps_towards(normals: wp.mat33d, count: int, normal: wp.vec3d):
 
 
 @wp.func
-def _projected(planes: DividingPlanes, vertex: int, x: wp.vec3d):
+def _projected(planes: DividingPlanes, vertex: int, x: wp.vec3d) -> wp.vec3d:
     """Returns the nearest position above the planes of a vertex, whatever their order (Goldfarb and Idnani 1983).
 
     The position lies on at most three planes, the active ones. The plane that it is farthest below joins them; planes
-    that then pull leave. The second is how far it is above all planes [m]. If rounding prevents an end, the position is
-    near, but not above all planes: the second is then negative.
+    that then pull leave. If rounding prevents an end, the position is near, but not above all planes.
     """
     normals = wp.mat33d()
     multipliers = wp.vec3d()
@@ -97,28 +94,24 @@ def _projected(planes: DividingPlanes, vertex: int, x: wp.vec3d):
     joins = bool(False)  # whether a plane is about to join the active ones
     normal = wp.vec3d()
     height = ZERO  # least coordinate along it
-    above = FAR
     multiplier = ZERO
     left = int(MAX_PLANE_STEPS)
     while left > 0:
         left -= 1
         if not joins:
             most = ZERO
-            above = FAR
             node = planes.first[vertex]
             while node >= 0:
                 other, least, margin = _half_space(planes, node)
                 node = planes.next[node / 2]
-                coordinate = wp.dot(other, x)
-                above = wp.min(above, coordinate - least)
-                missing = least + margin - coordinate
+                missing = least + margin - wp.dot(other, x)
                 if missing >= margin and missing >= most:
                     if missing > most or _precedes(other, normal):
                         most = missing
                         normal = other
                         height = least + margin
             if most == ZERO:
-                return x, above
+                return x
             joins = True
             multiplier = ZERO
         across, parts = _steps_towards(normals, count, normal)
@@ -132,7 +125,7 @@ def _projected(planes: DividingPlanes, vertex: int, x: wp.vec3d):
                 length = multipliers[j] / parts[j]
                 leaves = j
         if length == FAR:
-            return x, -ONE
+            return x
         for j in range(count):
             multipliers[j] = multipliers[j] - length * parts[j]
         multiplier += length
@@ -148,29 +141,22 @@ def _projected(planes: DividingPlanes, vertex: int, x: wp.vec3d):
             for j in range(leaves, count):
                 normals[j] = normals[j + 1]
                 multipliers[j] = multipliers[j + 1]
-    return x, -ONE
+    return x
 
 
 @wp.func
-def share_of_path(planes: DividingPlanes, vertex: int, x0: wp.vec3d, x1: wp.vec3d):
-    """Returns the share of a path, in [0, 1], up to which it is above the planes of its vertex.
-
-    The second is how far above them it ends there at least [m], before it is rounded.
-    """
+def share_of_path(planes: DividingPlanes, vertex: int, x0: wp.vec3d, x1: wp.vec3d) -> wp.float64:
+    """Returns the share of a path, in [0, 1], up to which it is above the planes of its vertex."""
     share = ONE
-    above = FAR
     node = planes.first[vertex]
-    while node >= 0:
+    while node >= 0 and share > ZERO:
         normal, least, margin = _half_space(planes, node)
         node = planes.next[node / 2]
         before = wp.dot(normal, x0) - least
         after = wp.dot(normal, x1) - least
-        if after <= ZERO and before > after:
-            share = wp.min(share, wp.max(before - margin, ZERO) / (before - after))
-            above = wp.min(above, margin)
-        else:
-            above = wp.min(above, wp.min(before, after))
-    return share, above
+        if after <= ZERO and before > after and before - margin < share * (before - after):  # few divisions
+            share = wp.max(before - margin, ZERO) / (before - after)
+    return share
 
 
 @wp.func
@@ -205,34 +191,20 @@ def _rounded(planes: DividingPlanes, vertex: int, x: wp.vec3d) -> wp.vec3:
 
 
 @wp.func
-def _most_below(planes: DividingPlanes, vertex: int, x: wp.vec3d) -> wp.float64:
-    """Returns how far a position is below where projection takes a vertex, of the plane that it is farthest below."""
-    below = ZERO
-    node = planes.first[vertex]
-    while node >= 0:
-        normal, least, margin = _half_space(planes, node)
-        node = planes.next[node / 2]
-        below = wp.max(below, least + margin - wp.dot(normal, x))
-    return below
-
-
-@wp.func
-def _is_too_far(planes: DividingPlanes, vertex: int, start: wp.vec3d, end: wp.vec3d, x: wp.vec3d) -> bool:
-    """Returns whether projection took a vertex from the end of its path farther than planes may: than the start is.
+def _most_correction(planes: DividingPlanes, vertex: int, start: wp.vec3d, end: wp.vec3d) -> wp.float64:
+    """Returns how far from the end of its path planes may take a vertex [m]: as far as it is from the start.
 
     The start is in the convex region above the planes, so that the nearest point of that region is no farther, except
     for rounding. Planes that nothing can move may have passed the start: then what lies between is added, and some
     more, as planes that are nearly parallel meet far away.
     """
-    more = wp.length(x - end) - (ONE + _ROUNDING) * wp.length(end - start)
-    return more > ZERO and more > WEDGE * _most_below(planes, vertex, start)
-
-
-@wp.func
-def _rounding(x: wp.vec3) -> wp.float64:
-    """Returns more than rounding to single precision moves a position along a unit vector [m]."""
-    exact = to_double(x)
-    return _HALF_ULP * (wp.abs(exact[0]) + wp.abs(exact[1]) + wp.abs(exact[2])) + wp.float64(_SMALLEST)
+    below = ZERO
+    node = planes.first[vertex]
+    while node >= 0:
+        normal, least, margin = _half_space(planes, node)
+        node = planes.next[node / 2]
+        below = wp.max(below, least + margin - wp.dot(normal, start))
+    return (ONE + _ROUNDING) * wp.length(end - start) + WEDGE * below
 
 
 @wp.func
@@ -242,12 +214,14 @@ def position_on_sides(planes: DividingPlanes, vertex: int, x0: wp.vec3, x1: wp.v
     Where projection does not find one, the way from ``x0`` is cut; where rounding leaves none, it ends there.
     """
     predicted = to_double(x1)
-    x, above = _projected(planes, vertex, predicted)
-    if _is_too_far(planes, vertex, to_double(x0), predicted, x):
+    if _is_above(planes, vertex, predicted):
+        return x1, False
+    start = to_double(x0)
+    x = _projected(planes, vertex, predicted)
+    if wp.length(x - predicted) > _most_correction(planes, vertex, start, predicted):
         x = predicted
-        above = -ONE
     end = to_single(x)
-    if above > _rounding(end) or _is_above(planes, vertex, to_double(end)):
+    if _is_above(planes, vertex, to_double(end)):
         return end, False
     end = _rounded(planes, vertex, x)  # elements may be nearer to each other than their coordinates are precise
     if _is_above(planes, vertex, to_double(end)):
@@ -260,12 +234,12 @@ def position_on_way(planes: DividingPlanes, vertex: int, x0: wp.vec3, x1: wp.vec
     """Returns how far a way is above all planes of a vertex: an end of it, or ``x0`` where rounding leaves none."""
     start = to_double(x0)
     way = to_double(x1) - start
-    share, above = share_of_path(planes, vertex, start, start + way)
+    share = share_of_path(planes, vertex, start, start + way)
     if share == ZERO:
         return x0
     if share == ONE:
         return x1
     end = to_single(start + share * way)
-    if above > _rounding(x0) + _rounding(x1) or _is_above(planes, vertex, to_double(end)):
+    if _is_above(planes, vertex, to_double(end)):
         return end
     return x0

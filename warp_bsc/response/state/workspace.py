@@ -347,7 +347,7 @@ class Workspace(Launches):
         """
         activate()
         for i in range(number):
-            self.launch_over_constraints(project, self.status)
+            self.launch_over_entries(project, [self.step, self.status], is_large=True)
             update(self, i == number - 1)
 
     def repeat_sweeps(self, activate: Callable[[], None], project: wp.Kernel, update: Callable) -> None:
