@@ -30,8 +30,8 @@ class Launches:
 
         Its last input is the number of its threads: each takes every so many-th entry, so that capacity that is not
         used costs nothing. On the CPU it is one thread, because Warp's additions are not atomic there, or eight for
-        each core for a kernel that runs ``on_cores``, see :func:`.launch_on_cores`. Of one that ``is_large``, as many as
-        run at once on a GPU, for their registers: two blocks.
+        each core for a kernel that runs ``on_cores``, see :func:`.launch_on_cores`. Of one that ``is_large``, two
+        blocks a multiprocessor of a GPU, as more do not run at once for their registers.
         """
         threads = 8 * cores_for(kernel, self.device) if on_cores and self.device.is_cpu else self._threads
         threads = threads // 4 if is_large and self.device.is_cuda else threads
