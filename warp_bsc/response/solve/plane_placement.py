@@ -177,7 +177,7 @@ def _move_to_sides(step: Step, planes: DividingPlanes, tolerance: wp.float64, st
         status.loop[Loop.MORE_PASSES] = 1
 
 
-@wp.kernel(launch_bounds=(BLOCK, 2))
+@wp.kernel
 def move_to_sides(step: Step, planes: DividingPlanes, tolerance: wp.float64, status: SolveStatus):
     """Moves each particle as near to where it wants to end as its planes let it come."""
     _move_to_sides(step, planes, tolerance, status, wp.tid())

@@ -149,13 +149,13 @@ def share_of_path(planes: DividingPlanes, vertex: int, x0: wp.vec3d, x1: wp.vec3
     """Returns the share of a path, in [0, 1], up to which it is above the planes of its vertex."""
     share = ONE
     node = planes.first[vertex]
-    while node >= 0 and share > ZERO:
+    while node >= 0:
         normal, least, margin = _half_space(planes, node)
         node = planes.next[node / 2]
         before = wp.dot(normal, x0) - least
         after = wp.dot(normal, x1) - least
-        if after <= ZERO and before > after and before - margin < share * (before - after):  # few divisions
-            share = wp.max(before - margin, ZERO) / (before - after)
+        if after <= ZERO and before > after:
+            share = wp.min(share, wp.max(before - margin, ZERO) / (before - after))
     return share
 
 
